@@ -1,0 +1,1 @@
+//! Peers that the project did not write, driven against the real binary.

@@ -1,0 +1,138 @@
+//! `camera.toml`: lens and pose as `calibrate` writes them and as a technician may by hand.
+
+use super::{Camera, Lens, LensModel};
+use crate::error::{Error, Result};
+use nalgebra::{Matrix3, Vector3};
+use serde::{Deserialize, Serialize};
+use std::path::Path;
+
+/// The file as written. Unknown keys are allowed: calibration reports add to it.
+#[derive(Clone, Debug, Deserialize, Serialize)]
+pub struct CameraFile {
+    image_size_px: [usize; 2],
+    lens: LensTable,
+    pose: Option<PoseTable>,
+}
+
+#[derive(Clone, Debug, Deserialize, Serialize)]
+struct LensTable {
+    model: LensModel,
+    fx_px: f64,
+    fy_px: f64,
+    cx_px: f64,
+    cy_px: f64,
+    distortion: Vec<f64>,
+}
+
+#[derive(Clone, Debug, Deserialize, Serialize)]
+struct PoseTable {
+    rotation: [[f64; 3]; 3],
+    translation_mm: [f64; 3],
+}
+
+/// Six written digits leave this much; a wrong sign or a swapped row leaves more than 1.
+const ROTATION_ERROR_MAX: f64 = 1e-3;
+const IMAGE_SIDE_PX: std::ops::RangeInclusive<usize> = 64..=16384;
+
+impl CameraFile {
+    /// Read and validate a camera file with a pose.
+    pub fn load(path: &Path) -> Result<Camera> {
+        let text = std::fs::read_to_string(path).map_err(|e| {
+            Error::configuration(format!("cannot read the camera calibration: {e}"))
+                .in_file(path)
+                .remedy("set camera.calibration to the file that `calibrate belt` wrote")
+        })?;
+        let file: Self = toml::from_str(&text).map_err(|e| {
+            Error::configuration(format!("not a camera calibration: {}", e.to_string().trim_end()))
+                .in_file(path)
+                .remedy("correct the line shown, or run `calibrate belt` again")
+        })?;
+        file.into_camera().map_err(|e| e.in_file(path))
+    }
+
+    /// Validate.
+    pub fn into_camera(self) -> Result<Camera> {
+        let [width, height] = self.image_size_px;
+        if !IMAGE_SIDE_PX.contains(&width) || !IMAGE_SIDE_PX.contains(&height) {
+            return Err(Error::configuration(format!("image_size_px = [{width}, {height}]"))
+                .allowed(format!("{} to {} px", IMAGE_SIDE_PX.start(), IMAGE_SIDE_PX.end()))
+                .remedy("give width and height of the camera's image in pixels"));
+        }
+        let lens = self.lens.into_lens(self.image_size_px)?;
+        let pose = self.pose.ok_or_else(|| {
+            Error::configuration("[pose] is missing: a lens alone does not know the belt")
+                .remedy("run `calibrate belt` with this file as --lens")
+        })?;
+        let (camera_from_belt, translation_mm) = pose.into_transform()?;
+        let camera =
+            Camera { image_size_px: self.image_size_px, lens, camera_from_belt, translation_mm };
+        let height_mm = camera.centre_in_belt().z;
+        if !(50.0..=20_000.0).contains(&height_mm) {
+            return Err(Error::configuration(format!(
+                "pose puts the camera {height_mm:.1} mm above the belt"
+            ))
+            .allowed("50 to 20000 mm, Z up from the belt")
+            .remedy("X_camera = R X_belt + t with t in mm; check its unit and the sign of Z"));
+        }
+        Ok(camera)
+    }
+}
+
+impl LensTable {
+    fn into_lens(self, [width, height]: [usize; 2]) -> Result<Lens> {
+        for (key, value, end) in [
+            ("fx_px", self.fx_px, 100 * width),
+            ("fy_px", self.fy_px, 100 * height),
+            ("cx_px", self.cx_px, width),
+            ("cy_px", self.cy_px, height),
+        ] {
+            if !(value > 0.0 && value < end as f64) {
+                return Err(Error::configuration(format!("lens.{key} = {value}"))
+                    .allowed(format!("above 0, below {end} px"))
+                    .remedy("give focal length and principal point in pixels, not mm"));
+            }
+        }
+        let count = self.distortion.len();
+        let expected: &[usize] = match self.model {
+            LensModel::Brown => &[4, 5],
+            LensModel::Fisheye => &[4],
+        };
+        if !expected.contains(&count) || self.distortion.iter().any(|k| !k.is_finite()) {
+            return Err(Error::configuration(format!("lens.distortion has {count} coefficients"))
+                .allowed("brown: k1 k2 p1 p2 k3; fisheye: k1 k2 k3 k4; finite numbers")
+                .remedy("write absent coefficients as 0"));
+        }
+        let mut distortion = [0.0; 5];
+        distortion[..count].copy_from_slice(&self.distortion);
+        Ok(Lens::new(self.model, [self.fx_px, self.fy_px], [self.cx_px, self.cy_px], distortion))
+    }
+}
+
+impl PoseTable {
+    /// The rotation is made exactly orthonormal: the nearest one in the Frobenius norm.
+    fn into_transform(self) -> Result<(Matrix3<f64>, Vector3<f64>)> {
+        let rows = self.rotation.concat();
+        let written = Matrix3::from_row_slice(&rows);
+        let error = (written * written.transpose() - Matrix3::identity()).amax();
+        let determinant = written.determinant();
+        // A comparison with NaN must refuse.
+        if !(error <= ROTATION_ERROR_MAX && determinant > 0.0) {
+            return Err(Error::configuration(format!(
+                "pose.rotation is not a rotation: |R R' - I| = {error:.3e}, determinant {determinant:.4}"
+            ))
+            .allowed(format!(
+                "orthonormal rows within {ROTATION_ERROR_MAX:e}, determinant +1 (right-handed)"
+            ))
+            .remedy("copy all nine numbers with at least 5 digits; check row order and signs"));
+        }
+        let svd = written.svd(true, true);
+        let (Some(u), Some(v_t)) = (svd.u, svd.v_t) else {
+            return Err(Error::configuration("pose.rotation has no singular value decomposition"));
+        };
+        let translation = Vector3::from(self.translation_mm);
+        if !translation.iter().all(|t| t.is_finite()) {
+            return Err(Error::configuration("pose.translation_mm is not finite"));
+        }
+        Ok((u * v_t, translation))
+    }
+}

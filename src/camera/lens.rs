@@ -1,0 +1,238 @@
+//! Lens models `brown` (Brown-Conrady, k1 k2 p1 p2 k3) and `fisheye` (Kannala-Brandt, k1..k4).
+//!
+//! Source: OpenCV's calib3d and fisheye modules; Kannala and Brandt 2006, eq. 6.
+
+use crate::units::RawPx;
+use nalgebra::{Matrix2, Vector2, Vector3};
+
+/// Which polynomial bends the rays.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, serde::Deserialize, serde::Serialize)]
+#[serde(rename_all = "lowercase")]
+pub enum LensModel {
+    /// Radial k1 k2 k3 and tangential p1 p2 terms on the normalised image plane.
+    Brown,
+    /// Polynomial k1..k4 in the angle to the optical axis.
+    Fisheye,
+}
+
+/// Projection from camera coordinates to raw pixels.
+#[derive(Clone, Debug)]
+pub struct Lens {
+    /// The distortion model.
+    pub model: LensModel,
+    /// Focal length along rows.
+    pub fx_px: f64,
+    /// Focal length along columns.
+    pub fy_px: f64,
+    /// Principal point, column.
+    pub cx_px: f64,
+    /// Principal point, row.
+    pub cy_px: f64,
+    /// `brown`: k1 k2 p1 p2 k3. `fisheye`: k1 k2 k3 k4 and an unused 0.
+    pub distortion: [f64; 5],
+    /// Largest radius (brown) or angle (fisheye) up to which the model is monotonic.
+    reach: f64,
+}
+
+impl Lens {
+    /// A lens; `reach` is found by walking outward until the model folds back.
+    pub fn new(model: LensModel, focal_px: [f64; 2], centre_px: [f64; 2], distortion: [f64; 5]) -> Self {
+        let [[fx_px, fy_px], [cx_px, cy_px]] = [focal_px, centre_px];
+        let mut lens =
+            Self { model, fx_px, fy_px, cx_px, cy_px, distortion, reach: f64::INFINITY };
+        // A 179 degree lens has tan = 115; 8 is 166 degrees, beyond any brown lens.
+        let end = match model {
+            LensModel::Brown => 8.0,
+            LensModel::Fisheye => std::f64::consts::PI,
+        };
+        let steps = 4000;
+        lens.reach = (1..=steps)
+            .map(|i| end * f64::from(i) / f64::from(steps))
+            .find(|&r| lens.radial_slope(r) <= 0.0)
+            .unwrap_or(end);
+        lens
+    }
+
+    /// Derivative of the distorted radius by radius (brown) or angle (fisheye).
+    fn radial_slope(&self, r: f64) -> f64 {
+        let [k1, k2, a, b, k3] = self.distortion;
+        let r2 = r * r;
+        match self.model {
+            LensModel::Brown => 1.0 + r2 * (3.0 * k1 + r2 * (5.0 * k2 + r2 * 7.0 * k3)),
+            LensModel::Fisheye => 1.0 + r2 * (3.0 * k1 + r2 * (5.0 * k2 + r2 * (7.0 * a + r2 * 9.0 * b))),
+        }
+    }
+
+    /// Raw pixel of a point in the camera frame; `None` where the model does not hold.
+    pub fn project(&self, in_camera: Vector3<f64>) -> Option<RawPx> {
+        let distorted = match self.model {
+            LensModel::Brown => {
+                if in_camera.z <= 0.0 {
+                    return None;
+                }
+                let p = Vector2::new(in_camera.x, in_camera.y) / in_camera.z;
+                if p.norm() >= self.reach {
+                    return None;
+                }
+                self.distort_brown(p).0
+            }
+            LensModel::Fisheye => {
+                let radius = in_camera.x.hypot(in_camera.y);
+                let theta = radius.atan2(in_camera.z);
+                if theta >= self.reach {
+                    return None;
+                }
+                let scale = if radius > 0.0 { self.distort_angle(theta) / radius } else { 0.0 };
+                Vector2::new(in_camera.x, in_camera.y) * scale
+            }
+        };
+        Some(RawPx {
+            x: self.fx_px * distorted.x + self.cx_px,
+            y: self.fy_px * distorted.y + self.cy_px,
+        })
+    }
+
+    /// Direction (not normalised) in the camera frame of a raw pixel's ray.
+    pub fn unproject(&self, px: RawPx) -> Option<Vector3<f64>> {
+        let target = Vector2::new((px.x - self.cx_px) / self.fx_px, (px.y - self.cy_px) / self.fy_px);
+        match self.model {
+            LensModel::Brown => {
+                let p = self.undistort_brown(target)?;
+                Some(Vector3::new(p.x, p.y, 1.0))
+            }
+            LensModel::Fisheye => {
+                let radius = target.norm();
+                let theta = self.undistort_angle(radius)?;
+                let across = if radius > 0.0 { target / radius * theta.sin() } else { target };
+                Some(Vector3::new(across.x, across.y, theta.cos()))
+            }
+        }
+    }
+
+    /// Distorted normalised point and its Jacobian.
+    fn distort_brown(&self, p: Vector2<f64>) -> (Vector2<f64>, Matrix2<f64>) {
+        let [k1, k2, p1, p2, k3] = self.distortion;
+        let (x, y) = (p.x, p.y);
+        let r2 = x * x + y * y;
+        let radial = 1.0 + r2 * (k1 + r2 * (k2 + r2 * k3));
+        let slope = k1 + r2 * (2.0 * k2 + r2 * 3.0 * k3); // d radial / d r2
+        let distorted = Vector2::new(
+            x * radial + 2.0 * p1 * x * y + p2 * (r2 + 2.0 * x * x),
+            y * radial + p1 * (r2 + 2.0 * y * y) + 2.0 * p2 * x * y,
+        );
+        let cross = 2.0 * x * y * slope + 2.0 * p1 * x + 2.0 * p2 * y;
+        let jacobian = Matrix2::new(
+            radial + 2.0 * x * x * slope + 2.0 * p1 * y + 6.0 * p2 * x,
+            cross,
+            cross,
+            radial + 2.0 * y * y * slope + 6.0 * p1 * y + 2.0 * p2 * x,
+        );
+        (distorted, jacobian)
+    }
+
+    /// Newton from the distorted point; five steps reach 1e-12 on real lenses.
+    fn undistort_brown(&self, target: Vector2<f64>) -> Option<Vector2<f64>> {
+        let mut p = target;
+        for _ in 0..30 {
+            let (distorted, jacobian) = self.distort_brown(p);
+            let error = distorted - target;
+            if error.norm() < 1e-12 {
+                return (p.norm() < self.reach).then_some(p);
+            }
+            p -= jacobian.try_inverse()? * error;
+        }
+        None
+    }
+
+    fn distort_angle(&self, theta: f64) -> f64 {
+        let [k1, k2, k3, k4, _] = self.distortion;
+        let t2 = theta * theta;
+        theta * (1.0 + t2 * (k1 + t2 * (k2 + t2 * (k3 + t2 * k4))))
+    }
+
+    fn undistort_angle(&self, radius: f64) -> Option<f64> {
+        let mut theta = radius.min(0.9 * self.reach);
+        for _ in 0..50 {
+            let error = self.distort_angle(theta) - radius;
+            if error.abs() < 1e-13 {
+                return Some(theta);
+            }
+            theta -= error / self.radial_slope(theta);
+            if !(0.0..self.reach).contains(&theta) {
+                return None;
+            }
+        }
+        None
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    const BROWN_OPENCV: [f64; 2] = [1239.015263615, 399.803498292];
+    const FISHEYE_OPENCV: [f64; 2] = [1121.612494575, 492.065941123];
+
+    fn lenses() -> [Lens; 2] {
+        [
+            Lens::new(
+                LensModel::Brown,
+                [1019.3, 1019.9],
+                [940.2, 599.1],
+                [-0.181, 0.080, 0.0005, -0.0004, -0.008],
+            ),
+            Lens::new(
+                LensModel::Fisheye,
+                [560.0, 561.0],
+                [960.0, 600.0],
+                [0.02, -0.006, 0.001, -0.0002, 0.0],
+            ),
+        ]
+    }
+
+    #[test]
+    fn project_inverts_unproject_over_the_whole_image() {
+        for lens in lenses() {
+            for y in (0..1200).step_by(50) {
+                for x in (0..1920).step_by(60) {
+                    let px = RawPx { x: f64::from(x), y: f64::from(y) };
+                    let ray = lens.unproject(px).expect("inside the model");
+                    let back = lens.project(ray).expect("inside the model");
+                    // Newton stops at 1e-12 of the focal length, 1e-9 px.
+                    assert!((back.x - px.x).hypot(back.y - px.y) < 1e-8, "{lens:?} {px:?} {back:?}");
+                }
+            }
+        }
+    }
+
+    /// Values printed by OpenCV 5.0 `projectPoints` for the point (300, -200, 1000).
+    #[test]
+    fn brown_matches_opencv() {
+        let [brown, _] = lenses();
+        let px = brown.project(Vector3::new(300.0, -200.0, 1000.0)).expect("in front");
+        assert!((px.x - BROWN_OPENCV[0]).hypot(px.y - BROWN_OPENCV[1]) < 1e-6, "{px:?}");
+    }
+
+    /// Values printed by OpenCV 5.0 `fisheye::projectPoints` for the same point.
+    #[test]
+    fn fisheye_matches_opencv() {
+        let [_, fisheye] = lenses();
+        let px = fisheye.project(Vector3::new(300.0, -200.0, 1000.0)).expect("in front");
+        assert!((px.x - FISHEYE_OPENCV[0]).hypot(px.y - FISHEYE_OPENCV[1]) < 1e-6, "{px:?}");
+    }
+
+    #[test]
+    fn a_point_behind_the_camera_has_no_image() {
+        let [brown, _] = lenses();
+        assert_eq!(brown.project(Vector3::new(0.0, 0.0, -1.0)), None);
+        assert_eq!(brown.project(Vector3::new(1.0, 0.0, 0.0)), None);
+    }
+
+    #[test]
+    fn a_ray_beyond_the_fold_has_no_image() {
+        let lens = Lens::new(LensModel::Brown, [500.0; 2], [320.0, 240.0], [-0.3, 0.0, 0.0, 0.0, 0.0]);
+        // r (1 - 0.3 r^2) turns back at r = 1 / sqrt(0.9) = 1.054.
+        assert!(lens.project(Vector3::new(1.0, 0.0, 1.0)).is_some());
+        assert_eq!(lens.project(Vector3::new(1.1, 0.0, 1.0)), None);
+    }
+}

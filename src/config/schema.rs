@@ -1,0 +1,258 @@
+//! The keys of the configuration file, their defaults and ranges.
+
+use crate::error::{Error, Result};
+use crate::units::BeltRect;
+use serde::Deserialize;
+use std::net::SocketAddr;
+use std::path::PathBuf;
+
+/// The configuration file.
+#[derive(Clone, Debug, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct Config {
+    /// `[camera]`
+    pub camera: CameraTable,
+    /// `[zone]`
+    pub zone: Zone,
+    /// `[belt]`
+    pub belt: Belt,
+    /// `[view]`
+    #[serde(default)]
+    pub view: View,
+    /// `[background]`
+    #[serde(default)]
+    pub background: Background,
+    /// `[segment]`
+    #[serde(default)]
+    pub segment: Segment,
+    /// `[odometry]`
+    #[serde(default)]
+    pub odometry: Odometry,
+    /// `[limits]`
+    #[serde(default)]
+    pub limits: Limits,
+    /// `[modbus]`
+    #[serde(default)]
+    pub modbus: Modbus,
+}
+
+/// `[camera]`: where the pictures come from and how they were taken.
+#[derive(Clone, Debug, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct CameraTable {
+    /// Calibration file, relative to the configuration file.
+    pub calibration: PathBuf,
+}
+
+/// `[zone]`: the part of the belt that the camera sees freely, belt coordinates.
+#[derive(Clone, Debug, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct Zone {
+    x_min_mm: f64,
+    x_max_mm: f64,
+    y_min_mm: f64,
+    y_max_mm: f64,
+}
+
+impl Zone {
+    /// As a rectangle.
+    pub fn rect(&self) -> BeltRect {
+        BeltRect {
+            x_min_mm: self.x_min_mm,
+            x_max_mm: self.x_max_mm,
+            y_min_mm: self.y_min_mm,
+            y_max_mm: self.y_max_mm,
+        }
+    }
+}
+
+/// `[belt]`
+#[derive(Clone, Debug, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct Belt {
+    /// Nominal speed; may be off by 5 %.
+    pub speed_mm_per_s: f64,
+}
+
+/// `[view]`: the rectified belt view.
+#[derive(Clone, Debug, Default, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct View {
+    /// Pixel size on the belt; default: the camera's own in the middle of the zone.
+    pub mm_per_px: Option<f64>,
+    /// Tallest parcel; default: 400 mm, at most 40 % of the camera height.
+    pub height_max_mm: Option<f64>,
+}
+
+/// `[background]`: the Gaussian mixture model.
+#[derive(Clone, Debug, Deserialize)]
+#[serde(deny_unknown_fields, default)]
+pub struct Background {
+    /// Frames at start-up on which the empty belt is learned and no parcel is reported.
+    pub learn_frames: u32,
+    /// Frames after which a change counts as background: 1 / learning rate.
+    pub history_frames: u32,
+    /// Foreground when further than this many standard deviations from every background mode.
+    pub threshold_sigma: f64,
+    /// Darker than the belt by no more than this factor is a shadow.
+    pub shadow_ratio_min: f64,
+}
+
+impl Default for Background {
+    fn default() -> Self {
+        Self { learn_frames: 15, history_frames: 500, threshold_sigma: 4.0, shadow_ratio_min: 0.72 }
+    }
+}
+
+/// `[segment]`: from mask to blobs.
+#[derive(Clone, Debug, Deserialize)]
+#[serde(deny_unknown_fields, default)]
+pub struct Segment {
+    /// Specks narrower than this vanish (opening).
+    pub open_px: usize,
+    /// Gaps narrower than this are filled (closing).
+    pub close_px: usize,
+    /// Blobs smaller than this on the belt are ignored.
+    pub area_min_mm2: f64,
+}
+
+impl Default for Segment {
+    fn default() -> Self {
+        Self { open_px: 1, close_px: 3, area_min_mm2: 300.0 }
+    }
+}
+
+/// `[odometry]`: belt motion from the belt's own texture.
+#[derive(Clone, Debug, Deserialize)]
+#[serde(deny_unknown_fields, default)]
+pub struct Odometry {
+    /// Largest relative error of the nominal speed that is searched.
+    pub speed_error_max: f64,
+}
+
+impl Default for Odometry {
+    fn default() -> Self {
+        Self { speed_error_max: 0.06 }
+    }
+}
+
+/// `[limits]`: the size of every table.
+#[derive(Clone, Debug, Deserialize)]
+#[serde(deny_unknown_fields, default)]
+pub struct Limits {
+    /// The memory plan may not need more.
+    pub memory_mib_max: usize,
+    /// Parcels in view at once.
+    pub tracks_max: usize,
+    /// Runs of foreground pixels in one frame.
+    pub runs_max: usize,
+    /// Blobs in one frame.
+    pub blobs_max: usize,
+    /// Frames of one pass whose edges are kept for the fit.
+    pub views_per_track_max: usize,
+    /// Frames between camera and vision thread.
+    pub frames_queued_max: usize,
+}
+
+impl Default for Limits {
+    fn default() -> Self {
+        Self {
+            memory_mib_max: 256,
+            tracks_max: 24,
+            runs_max: 16384,
+            blobs_max: 512,
+            views_per_track_max: 96,
+            frames_queued_max: 4,
+        }
+    }
+}
+
+/// `[modbus]`: the server for the PLC.
+#[derive(Clone, Debug, Deserialize)]
+#[serde(deny_unknown_fields, default)]
+pub struct Modbus {
+    /// Address and port; 502 needs CAP_NET_BIND_SERVICE.
+    pub listen: SocketAddr,
+    /// Clients at once.
+    pub connections_max: usize,
+    /// A client silent for this long is disconnected.
+    pub idle_timeout_s: u64,
+}
+
+impl Default for Modbus {
+    fn default() -> Self {
+        Self {
+            listen: SocketAddr::from(([0, 0, 0, 0], 502)),
+            connections_max: 16,
+            idle_timeout_s: 60,
+        }
+    }
+}
+
+impl Config {
+    /// Parse and check each key on its own.
+    pub fn parse(text: &str) -> Result<Self> {
+        let config: Self = toml::from_str(text).map_err(|e| {
+            Error::configuration(e.to_string().trim_end().to_owned())
+                .allowed("the keys of config/reference.toml; lengths in mm, speeds in mm per s")
+                .remedy("correct the line shown")
+        })?;
+        config.check()?;
+        Ok(config)
+    }
+
+    fn check(&self) -> Result<()> {
+        let Self { camera: _, zone, belt, view, background, segment, odometry, limits, modbus } = self;
+        for (key, mm) in [
+            ("zone.x_min_mm", zone.x_min_mm),
+            ("zone.x_max_mm", zone.x_max_mm),
+            ("zone.y_min_mm", zone.y_min_mm),
+            ("zone.y_max_mm", zone.y_max_mm),
+        ] {
+            range(key, mm, -20_000.0, 20_000.0, "mm")?;
+        }
+        range("zone.x_max_mm - zone.x_min_mm", zone.x_max_mm - zone.x_min_mm, 50.0, 10_000.0, "mm")?;
+        range("zone.y_max_mm - zone.y_min_mm", zone.y_max_mm - zone.y_min_mm, 50.0, 10_000.0, "mm")?;
+        range("belt.speed_mm_per_s", belt.speed_mm_per_s, 10.0, 10_000.0, "mm per s")?;
+        if let Some(mm) = view.mm_per_px {
+            range("view.mm_per_px", mm, 0.05, 20.0, "mm")?;
+        }
+        if let Some(mm) = view.height_max_mm {
+            range("view.height_max_mm", mm, 5.0, 5_000.0, "mm")?;
+        }
+        count("background.learn_frames", background.learn_frames as usize, 1, 1000)?;
+        count("background.history_frames", background.history_frames as usize, 20, 20_000)?;
+        range("background.threshold_sigma", background.threshold_sigma, 1.0, 10.0, "")?;
+        range("background.shadow_ratio_min", background.shadow_ratio_min, 0.1, 1.0, "")?;
+        count("segment.open_px", segment.open_px, 0, 10)?;
+        count("segment.close_px", segment.close_px, 0, 30)?;
+        range("segment.area_min_mm2", segment.area_min_mm2, 1.0, 1e6, "mm2")?;
+        range("odometry.speed_error_max", odometry.speed_error_max, 0.0, 0.2, "")?;
+        count("limits.memory_mib_max", limits.memory_mib_max, 1, 16_384)?;
+        count("limits.tracks_max", limits.tracks_max, 1, 256)?;
+        count("limits.runs_max", limits.runs_max, 256, 1 << 20)?;
+        count("limits.blobs_max", limits.blobs_max, 16, 1 << 16)?;
+        count("limits.views_per_track_max", limits.views_per_track_max, 16, 1024)?;
+        count("limits.frames_queued_max", limits.frames_queued_max, 2, 15)?;
+        count("modbus.connections_max", modbus.connections_max, 1, 256)?;
+        count("modbus.idle_timeout_s", modbus.idle_timeout_s as usize, 1, 86_400)
+    }
+}
+
+fn range(key: &str, value: f64, min: f64, max: f64, unit: &str) -> Result<()> {
+    if (min..=max).contains(&value) {
+        return Ok(());
+    }
+    let remedy = if unit.starts_with("mm") && value.abs() < min.max(1.0) && value != 0.0 {
+        "this looks like metres or centimetres: write it in mm"
+    } else {
+        "correct the value"
+    };
+    Err(Error::configuration(format!("{key} = {value}"))
+        .allowed(format!("{min} to {max} {unit}").trim_end())
+        .remedy(remedy))
+}
+
+fn count(key: &str, value: usize, min: usize, max: usize) -> Result<()> {
+    range(key, value as f64, min as f64, max as f64, "")
+}

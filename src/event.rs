@@ -1,0 +1,151 @@
+//! What leaves the pipeline: parcel records and counters.
+
+use serde::ser::{SerializeSeq, Serializer};
+
+/// Doubts about a record, as a set.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub struct Flags(u16);
+
+impl Flags {
+    /// Still inside when the input ended.
+    pub const UNFINISHED: Self = Self(1 << 0);
+    /// Its image ran together with a neighbour's for some of the pass.
+    pub const MERGED: Self = Self(1 << 1);
+    /// It reached out of what the camera sees of the zone.
+    pub const CLIPPED: Self = Self(1 << 2);
+    /// The height's standard deviation is above 3 mm.
+    pub const HEIGHT_UNCERTAIN: Self = Self(1 << 3);
+    /// The belt speed was assumed, not measured, for most of the pass.
+    pub const SPEED_ASSUMED: Self = Self(1 << 4);
+    /// It vanished inside the zone.
+    pub const LOST: Self = Self(1 << 5);
+    /// Too few edges were found: size from the silhouette alone.
+    pub const SILHOUETTE_ONLY: Self = Self(1 << 6);
+
+    /// Every flag with its name in records, in bit order.
+    pub const NAMES: [(Self, &'static str); 7] = [
+        (Self::UNFINISHED, "unfinished"),
+        (Self::MERGED, "merged"),
+        (Self::CLIPPED, "clipped"),
+        (Self::HEIGHT_UNCERTAIN, "height_uncertain"),
+        (Self::SPEED_ASSUMED, "speed_assumed"),
+        (Self::LOST, "lost"),
+        (Self::SILHOUETTE_ONLY, "silhouette_only"),
+    ];
+
+    /// Add `flag` when `condition` holds.
+    pub fn set(&mut self, flag: Self, condition: bool) {
+        if condition {
+            self.0 |= flag.0;
+        }
+    }
+
+    /// Whether `flag` is in the set.
+    pub fn has(self, flag: Self) -> bool {
+        self.0 & flag.0 == flag.0
+    }
+
+    /// The set as bits, as the PLC reads it.
+    pub fn bits(self) -> u16 {
+        self.0
+    }
+}
+
+impl serde::Serialize for Flags {
+    fn serialize<S: Serializer>(&self, serializer: S) -> Result<S::Ok, S::Error> {
+        let mut seq = serializer.serialize_seq(None)?;
+        for (_, name) in Self::NAMES.iter().filter(|(flag, _)| self.has(*flag)) {
+            seq.serialize_element(name)?;
+        }
+        seq.end()
+    }
+}
+
+/// What the parcel looks like.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, serde::Serialize)]
+#[serde(rename_all = "lowercase")]
+pub enum Shape {
+    /// The edges of a cuboid were found where it says.
+    Box,
+    /// Anything else; the dimensions are of the cuboid that fits best.
+    Irregular,
+}
+
+/// One parcel, as it is reported: once, when it leaves the zone. Field order is that of the
+/// JSON line.
+#[derive(Clone, Copy, Debug, PartialEq, serde::Serialize)]
+pub struct ParcelRecord {
+    /// From 1, never skips.
+    pub seq: u32,
+    /// Frame, from 0, at which `x_mm` and `y_mm` hold.
+    pub frame: u64,
+    /// Its time from the first frame.
+    pub t_s: f64,
+    /// Longer side of the footprint.
+    pub length_mm: f64,
+    /// Shorter side of the footprint.
+    pub width_mm: f64,
+    /// Height over the belt.
+    pub height_mm: f64,
+    /// Length axis against +X, in (-90, 90].
+    pub yaw_deg: f64,
+    /// Footprint centre along travel.
+    pub x_mm: f64,
+    /// Footprint centre across the belt, left positive.
+    pub y_mm: f64,
+    /// Standard deviation of the length.
+    pub sigma_length_mm: f64,
+    /// Standard deviation of the width.
+    pub sigma_width_mm: f64,
+    /// Standard deviation of the height.
+    pub sigma_height_mm: f64,
+    /// Mean belt speed over the pass.
+    pub belt_speed_mm_per_s: f64,
+    /// Cuboid or not.
+    pub shape: Shape,
+    /// Doubts.
+    pub flags: Flags,
+}
+
+impl ParcelRecord {
+    /// Values rounded to what they can mean: 0.01 mm and degrees, 0.1 ms.
+    #[must_use]
+    pub fn rounded(mut self) -> Self {
+        let round = |value: &mut f64, steps: f64| *value = (*value * steps).round() / steps;
+        round(&mut self.t_s, 1e4);
+        for value in [
+            &mut self.length_mm,
+            &mut self.width_mm,
+            &mut self.height_mm,
+            &mut self.yaw_deg,
+            &mut self.x_mm,
+            &mut self.y_mm,
+            &mut self.sigma_length_mm,
+            &mut self.sigma_width_mm,
+            &mut self.sigma_height_mm,
+            &mut self.belt_speed_mm_per_s,
+        ] {
+            round(value, 100.0);
+        }
+        self
+    }
+}
+
+/// Things that happened and must not pass unnoticed; all only grow.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub struct Counters {
+    /// Frames processed.
+    pub frames: u64,
+    /// Parcels reported.
+    pub parcels: u64,
+    /// Parcels that left without a size: seen too briefly or never alone.
+    pub unmeasured: u64,
+    /// Parcels that vanished inside the view.
+    pub lost: u64,
+    /// Frames with more runs or blobs than the tables hold.
+    pub segment_overflows: u64,
+    /// Blobs that found no free track.
+    pub track_overflows: u64,
+    /// Records that found the event queue full.
+    pub event_overflows: u64,
+}

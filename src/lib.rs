@@ -1,0 +1,37 @@
+//! Beltgauge: one fixed 2D camera over a conveyor, every parcel's size to the sorter PLC.
+//!
+//! The map of the crate, in the order a frame takes:
+//!
+//! ```text
+//! source -> pipeline::step( rectify -> background -> segment -> odometry -> track -> measure )
+//!        -> event::ParcelRecord -> plc
+//! ```
+//!
+//! - [`units`], [`error`], [`image`]: what everything speaks.
+//! - [`camera`]: lens, pose and belt view; pure geometry.
+//! - [`config`]: TOML to a checked [`config::Site`].
+//! - [`plan`]: all memory of the vision path, named and reasoned, in one mapping.
+//! - [`kernel`]: pixel loops on slices. [`stage`]: the steps that own state.
+//! - [`belt`]: where the belt is. [`pipeline`]: the steps in order. [`event`]: what comes out.
+//! - [`source`]: where frames come from. [`plc`]: how records reach the PLC.
+//! - [`run`]: threads and rings; the only room that knows source, pipeline and plc.
+//!
+//! Invariants: `pipeline::step` reads no clock and allocates nothing; a record is emitted
+//! once; dependencies point one way (`tests/tidy.rs` checks it).
+//!
+//! Deliberately absent: a framework, plug-ins, a user interface, learning from data, any
+//! claim of legal metrology.
+
+pub mod belt;
+pub mod camera;
+pub mod config;
+pub mod error;
+pub mod event;
+pub mod image;
+pub mod kernel;
+pub mod pipeline;
+pub mod plan;
+pub mod run;
+pub mod source;
+pub mod stage;
+pub mod units;

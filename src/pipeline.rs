@@ -1,0 +1,356 @@
+//! `step()`: the whole algorithm, in order, for one frame.
+//!
+//! In: a raw frame and its time. Out: parcel records, at most one a track and frame.
+//! Owns: every stage, in one mapping planned from the configuration. Reads no clock, draws no
+//! random number, allocates nothing: a recording replays to the same records on every run.
+
+use crate::belt::BeltPosition;
+use crate::config::Site;
+use crate::error::{Error, Result};
+use crate::event::{Counters, Flags, ParcelRecord, Shape};
+use crate::image::{FrameTime, Plane};
+use crate::kernel::scalar::bits::{dilate3x3, words};
+use crate::plan::{Block, Plan};
+use crate::stage::background::Background;
+use crate::stage::measure::{self, Estimate, Frame, Measure};
+use crate::stage::odometry::Odometry;
+use crate::stage::rectify::Rectify;
+use crate::stage::segment::Segment;
+use crate::stage::track::{Change, NOBODY, Phase, Track, Tracker};
+use crate::units::BeltRect;
+
+/// Below this share of profiles with an edge where the cuboid has one, it is no cuboid.
+const BOX_EDGE_SHARE_MIN: f64 = 0.5;
+/// Above this sigma a height is flagged.
+const HEIGHT_SIGMA_MAX_MM: f64 = 3.0;
+/// Above this relative sigma the belt speed counts as assumed.
+const SPEED_SIGMA_MAX: f64 = 0.01;
+/// The mask is widened this often before it keeps belt texture and learning away.
+const COVER_DILATIONS: usize = 2;
+
+/// When and where a track passed the middle of the zone.
+#[derive(Clone, Copy)]
+struct Reference {
+    /// When the track began.
+    began_s: f64,
+    time: FrameTime,
+    at: BeltPosition,
+    /// It has passed; before that it is just the newest frame.
+    fixed: bool,
+    clipped: bool,
+}
+
+/// The pipeline.
+pub struct Pipeline {
+    site: Site,
+    zone: BeltRect,
+    rectify: Rectify,
+    background: Background,
+    odometry: Odometry,
+    segment: Segment,
+    tracker: Tracker,
+    measure: Measure,
+    /// Bit mask: parcels and their surroundings in the last frame.
+    covered: Block<u64>,
+    /// Bit mask: pixels that the background must not learn.
+    hold: Block<u64>,
+    scratch: Block<u64>,
+    references: Block<Reference>,
+    at: BeltPosition,
+    last: Option<FrameTime>,
+    counters: Counters,
+    plan: Plan,
+}
+
+/// The memory plan of a site's pipeline.
+pub fn plan(site: &Site) -> Plan {
+    let mut plan = Plan::default();
+    let (size, limits) = (site.view.size_px, &site.config.limits);
+    Rectify::plan(&site.view, &mut plan);
+    Background::plan(size, &mut plan);
+    Odometry::plan(&site.view, &site.config.zone.rect(), &mut plan);
+    Segment::plan(size, limits, &mut plan);
+    Tracker::plan(limits.tracks_max, limits.blobs_max, &mut plan);
+    Measure::plan(limits.tracks_max, limits.views_per_track_max, &mut plan);
+    let mask = words(size[0]) * size[1];
+    plan.add::<u64>("pipeline.covered", mask, "bit: parcel or near one in the last frame");
+    plan.add::<u64>("pipeline.hold", mask, "bit: not to be learned as background");
+    plan.add::<u64>("pipeline.scratch", mask, "the other half of each dilation");
+    plan.add::<Reference>("pipeline.references", limits.tracks_max, "limits.tracks_max");
+    plan
+}
+
+impl Pipeline {
+    /// Plan, map and seal the memory, and compute the tables.
+    pub fn new(site: Site) -> Result<Self> {
+        let mut memory = plan(&site).reserve(site.config.limits.memory_mib_max)?;
+        let (zone, view, config) = (site.config.zone.rect(), &site.view, &site.config);
+        let magnification_max = view.magnification(site.height_max_mm);
+        let start = FrameTime { index: 0, t_s: 0.0 };
+        let nowhere =
+            Reference { began_s: 0.0, time: start, at: BeltPosition::default(), fixed: false, clipped: false };
+        let rectify = Rectify::new(&site.camera, view, &mut memory)?;
+        let background =
+            Background::new(view.size_px, config.background.clone(), &mut memory)?;
+        let odometry = Odometry::new(
+            view,
+            &zone,
+            config.belt.speed_mm_per_s,
+            config.odometry.speed_error_max,
+            &mut memory,
+        )?;
+        let segment =
+            Segment::new(view.size_px, view.mm_per_px, config.segment.clone(), &mut memory)?;
+        let tracker = Tracker::new(view.mm_per_px, magnification_max, &mut memory)?;
+        let measure = Measure::new(
+            view.clone(),
+            zone,
+            site.height_max_mm,
+            config.limits.views_per_track_max,
+            &mut memory,
+        )?;
+        Ok(Self {
+            rectify,
+            background,
+            odometry,
+            segment,
+            tracker,
+            measure,
+            covered: memory.take("pipeline.covered", 0)?,
+            hold: memory.take("pipeline.hold", 0)?,
+            scratch: memory.take("pipeline.scratch", 0)?,
+            references: memory.take("pipeline.references", nowhere)?,
+            at: BeltPosition::default(),
+            last: None,
+            counters: Counters::default(),
+            plan: memory.seal()?,
+            zone,
+            site,
+        })
+    }
+
+    /// Process one frame; `emit` takes each parcel that has left the zone.
+    pub fn step(
+        &mut self,
+        raw: Plane<'_>,
+        time: FrameTime,
+        emit: &mut dyn FnMut(ParcelRecord),
+    ) -> Result<()> {
+        self.check_size(raw, time)?;
+        let dt_s = self.last.map_or(0.0, |last| time.t_s - last.t_s);
+        self.last = Some(time);
+        self.counters.frames += 1;
+
+        self.rectify.step(raw);
+        self.hold_background();
+        self.background.step(self.rectify.view(), self.rectify.seen(), &self.hold);
+        if !self.background.learned() {
+            return Ok(());
+        }
+        self.segment.step(self.background.foreground());
+        self.cover();
+        let motion =
+            self.odometry.step(self.rectify.view(), &self.background, &self.covered, dt_s);
+        self.at.advance(motion.step_mm, motion.measured);
+        self.tracker.step(self.segment.blobs(), motion.step_mm, self.at);
+        self.measure_tracks(time);
+        self.report(emit);
+        self.counters.segment_overflows = self.segment.overflows;
+        self.counters.track_overflows = self.tracker.overflows;
+        Ok(())
+    }
+
+    /// The input has ended: report what is still inside, flagged unfinished.
+    pub fn finish(&mut self, emit: &mut dyn FnMut(ParcelRecord)) {
+        for slot in 0..self.tracker.tracks().len() {
+            if self.tracker.tracks()[slot].phase == Phase::Riding {
+                self.emit(slot, Flags::UNFINISHED, emit);
+                self.tracker.set_left(slot);
+            }
+        }
+    }
+
+    fn check_size(&self, raw: Plane<'_>, time: FrameTime) -> Result<()> {
+        let [width, height] = self.site.camera.image_size_px;
+        if [raw.width(), raw.height()] == [width, height] {
+            return Ok(());
+        }
+        Err(Error::failure(format!("a frame of {} x {} px", raw.width(), raw.height()))
+            .at(format!("frame {}", time.index))
+            .allowed(format!("{width} x {height} px, the calibration's image_size_px"))
+            .remedy("use the calibration of this camera and image size"))
+    }
+
+    /// Not to be learned: parcels, or the whole belt at a standstill, when its texture and
+    /// whatever stands on it would become background.
+    fn hold_background(&mut self) {
+        if self.odometry.stands_still() {
+            self.hold.fill(u64::MAX);
+            return;
+        }
+        let width = self.site.view.size_px[0];
+        let n = words(width);
+        self.hold.fill(0);
+        for run in self.segment.runs() {
+            let owner = self.tracker.owners().get(run.label as usize).copied().unwrap_or(NOBODY);
+            let held = self.tracker.tracks().get(usize::from(owner)).is_some_and(Track::is_parcel);
+            if held {
+                set_bits(&mut self.hold[usize::from(run.v) * n..][..n], run.start, run.end);
+            }
+        }
+        widen(&mut self.hold, &mut self.scratch, width);
+    }
+
+    /// What is not free belt: all foreground, widened by the shadows around it.
+    fn cover(&mut self) {
+        self.covered.copy_from_slice(self.background.foreground());
+        widen(&mut self.covered, &mut self.scratch, self.site.view.size_px[0]);
+        for (covered, seen) in self.covered.iter_mut().zip(self.rectify.seen()) {
+            *covered |= !seen;
+        }
+    }
+
+    fn measure_tracks(&mut self, time: FrameTime) {
+        for &(slot, change) in self.tracker.changes() {
+            if change == Change::Began {
+                self.measure.begin(slot, self.at);
+                self.references[slot] =
+                    Reference { began_s: time.t_s, time, at: self.at, fixed: false, clipped: false };
+            }
+        }
+        let frame = Frame {
+            view: &self.site.view,
+            zone: &self.zone,
+            grey: self.rectify.view(),
+            seen: self.rectify.seen(),
+        };
+        let middle_mm = self.zone.centre().x;
+        for (slot, track) in self.tracker.tracks().iter().enumerate() {
+            if !matches!(track.phase, Phase::Candidate | Phase::Riding) {
+                continue;
+            }
+            let owners = self.tracker.owners();
+            let alone = self.segment.runs().iter().filter(|run| {
+                !track.merged && owners.get(run.label as usize) == Some(&(slot as u16))
+            });
+            self.measure.observe(slot, self.at, &frame, alone);
+            let reference = &mut self.references[slot];
+            if !reference.fixed {
+                let outline = self.measure.outline(slot, self.at);
+                let x_mm = outline.map_or(f64::NEG_INFINITY, |o| {
+                    0.25 * o.base.iter().map(|v| v.over_belt.x).sum::<f64>()
+                });
+                *reference = Reference { time, at: self.at, fixed: x_mm >= middle_mm, ..*reference };
+            }
+        }
+    }
+
+    /// Emit what has passed the end of the zone, and what was lost on the way.
+    fn report(&mut self, emit: &mut dyn FnMut(ParcelRecord)) {
+        for i in 0..self.tracker.changes().len() {
+            let (slot, change) = self.tracker.changes()[i];
+            if change == Change::Lost {
+                self.counters.lost += 1;
+                self.emit(slot, Flags::LOST, emit);
+            }
+        }
+        for slot in 0..self.tracker.tracks().len() {
+            let track = &self.tracker.tracks()[slot];
+            if track.phase != Phase::Riding {
+                continue;
+            }
+            let trailing_mm = match self.measure.outline(slot, self.at) {
+                Some(outline) => outline.trailing_x_mm(),
+                None => {
+                    let px = crate::units::BeltPx { u: f64::from(track.bounds.u0), v: 0.0 };
+                    self.site.view.belt_point(px).x
+                }
+            };
+            if trailing_mm > self.zone.x_max_mm {
+                self.emit(slot, Flags::default(), emit);
+                self.tracker.set_left(slot);
+            }
+        }
+    }
+
+    fn emit(&mut self, slot: usize, flags: Flags, emit: &mut dyn FnMut(ParcelRecord)) {
+        let reference = self.references[slot];
+        let Some(estimate) = self.measure.finish(slot, reference.at) else {
+            self.counters.unmeasured += 1;
+            return;
+        };
+        self.counters.parcels += 1;
+        let record = self.record(slot, &estimate, reference, flags);
+        emit(record);
+    }
+
+    fn record(&self, slot: usize, fit: &Estimate, reference: Reference, flags: Flags) -> ParcelRecord {
+        let track = &self.tracker.tracks()[slot];
+        let (p, s) = (&fit.params, &fit.sigma);
+        let travel_sigma = self.at.sigma_since(&track.first);
+        let elapsed_s = self.last.map_or(0.0, |last| last.t_s - reference.began_s);
+        let travel_mm = self.at.travel_mm - track.first.travel_mm;
+        let shape = if fit.edge_share >= BOX_EDGE_SHARE_MIN { Shape::Box } else { Shape::Irregular };
+        let mut record = ParcelRecord {
+            seq: self.counters.parcels as u32,
+            frame: reference.time.index,
+            t_s: reference.time.t_s,
+            length_mm: p[measure::LENGTH],
+            width_mm: p[measure::WIDTH],
+            height_mm: p[measure::HEIGHT],
+            yaw_deg: p[measure::YAW].to_degrees(),
+            x_mm: p[measure::X],
+            y_mm: p[measure::Y],
+            sigma_length_mm: s[measure::LENGTH],
+            sigma_width_mm: s[measure::WIDTH],
+            sigma_height_mm: s[measure::HEIGHT],
+            belt_speed_mm_per_s: p[measure::SCALE] * travel_mm / elapsed_s.max(1e-9),
+            shape,
+            flags,
+        };
+        record.flags.set(Flags::MERGED, track.ever_merged);
+        record.flags.set(Flags::CLIPPED, reference.clipped);
+        record.flags.set(Flags::HEIGHT_UNCERTAIN, record.sigma_height_mm > HEIGHT_SIGMA_MAX_MM);
+        record.flags.set(Flags::SPEED_ASSUMED, travel_sigma > SPEED_SIGMA_MAX);
+        record.flags.set(Flags::SILHOUETTE_ONLY, fit.edge_count == 0);
+        record.rounded()
+    }
+
+    /// Frames at which a parcel, by slot, passed the middle of the zone: where its record holds.
+    pub fn reference_frames(&self) -> impl Iterator<Item = (usize, u64)> + '_ {
+        let tracks = self.tracker.tracks().iter().enumerate();
+        tracks
+            .filter(|(_, t)| t.phase == Phase::Riding)
+            .map(|(slot, _)| (slot, self.references[slot].time.index))
+    }
+
+    /// What happened so far.
+    pub fn counters(&self) -> Counters {
+        self.counters
+    }
+
+    /// The memory in use.
+    pub fn plan(&self) -> &Plan {
+        &self.plan
+    }
+
+    /// The site it was built for.
+    pub fn site(&self) -> &Site {
+        &self.site
+    }
+}
+
+/// Dilate a mask of rows of `width` pixels.
+fn widen(mask: &mut Block<u64>, scratch: &mut Block<u64>, width: usize) {
+    for _ in 0..COVER_DILATIONS {
+        dilate3x3(mask, scratch, width);
+        std::mem::swap(mask, scratch);
+    }
+}
+
+/// Set bits `start..end` of a row.
+fn set_bits(row: &mut [u64], start: u16, end: u16) {
+    for u in usize::from(start)..usize::from(end) {
+        row[u / 64] |= 1 << (u % 64);
+    }
+}

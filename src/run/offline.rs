@@ -1,0 +1,96 @@
+//! `beltgauge measure`: a replay through the pipeline, as fast as it goes.
+
+use super::Annotator;
+use crate::config::Site;
+use crate::error::{Error, Result};
+use crate::event::{Counters, ParcelRecord};
+use crate::image::Plane;
+use crate::pipeline::Pipeline;
+use crate::source::FrameSource;
+use std::io::{BufWriter, Write};
+use std::path::Path;
+
+/// Where the results of a replay go, besides the table on standard output.
+#[derive(Clone, Copy, Debug, Default)]
+pub struct Outputs<'a> {
+    /// One JSON line a parcel.
+    pub jsonl: Option<&'a Path>,
+    /// Annotated pictures.
+    pub annotate: Option<&'a Path>,
+}
+
+/// Measure a replay. After a broken input what was measured until there is written, with the
+/// parcels still inside flagged unfinished, and the error returned.
+pub fn measure(
+    mut source: Box<dyn FrameSource>,
+    site: Site,
+    outputs: Outputs<'_>,
+    on_record: &mut dyn FnMut(&ParcelRecord),
+) -> Result<Counters> {
+    let [width, height] = source.size_px();
+    let expected = site.camera.image_size_px;
+    if [width, height] != expected {
+        return Err(Error::configuration(format!("the input has frames of {width} x {height} px"))
+            .allowed(format!("{} x {} px, the calibration's image_size_px", expected[0], expected[1]))
+            .remedy("use the calibration of this camera and image size"));
+    }
+    let mut annotator = outputs.annotate.map(|f| Annotator::new(f, [width, height])).transpose()?;
+    let mut lines = outputs.jsonl.map(JsonLines::create).transpose()?;
+    let mut pipeline = Pipeline::new(site)?;
+    let mut frame = vec![0; width * height];
+    let mut records: Vec<ParcelRecord> = Vec::new();
+    let mut last_index = 0;
+    loop {
+        let next = source.next_into(&mut frame);
+        records.clear();
+        let ended = match next {
+            Ok(Some(time)) => {
+                last_index = time.index;
+                let raw = Plane::packed(&frame, width, height)
+                    .ok_or_else(|| Error::failure("a frame of another size"))?;
+                pipeline.step(raw, time, &mut |r| records.push(r))?;
+                None
+            }
+            Ok(None) => Some(Ok(pipeline.counters())),
+            Err(error) => Some(Err(error)),
+        };
+        if ended.is_some() {
+            pipeline.finish(&mut |r| records.push(r));
+        }
+        for record in &records {
+            if let Some(lines) = &mut lines {
+                lines.write(record)?;
+            }
+            on_record(record);
+        }
+        if let Some(annotator) = &mut annotator {
+            annotator.frame(&frame, last_index, &pipeline, &records)?;
+        }
+        if let Some(result) = ended {
+            return result.map(|_| pipeline.counters());
+        }
+    }
+}
+
+/// A file of JSON lines, complete after every line.
+struct JsonLines<'a> {
+    path: &'a Path,
+    file: BufWriter<std::fs::File>,
+}
+
+impl<'a> JsonLines<'a> {
+    fn create(path: &'a Path) -> Result<Self> {
+        let file = std::fs::File::create(path).map_err(|e| {
+            Error::failure(format!("cannot create the record file: {e}")).in_file(path)
+        })?;
+        Ok(Self { path, file: BufWriter::new(file) })
+    }
+
+    fn write(&mut self, record: &ParcelRecord) -> Result<()> {
+        serde_json::to_writer(&mut self.file, record)
+            .map_err(std::io::Error::from)
+            .and_then(|()| self.file.write_all(b"\n"))
+            .and_then(|()| self.file.flush())
+            .map_err(|e| Error::failure(format!("cannot write a record: {e}")).in_file(self.path))
+    }
+}

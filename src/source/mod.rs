@@ -1,0 +1,48 @@
+//! Where frames come from: files, a directory, or the synthetic belt.
+
+mod directory;
+pub mod synthetic;
+mod y4m;
+
+pub use directory::Directory;
+pub use y4m::Y4m;
+
+use crate::error::{Error, Result};
+use crate::image::FrameTime;
+use std::path::Path;
+
+/// A stream of mono frames of one size.
+pub trait FrameSource: Send {
+    /// Width and height of every frame.
+    fn size_px(&self) -> [usize; 2];
+
+    /// Frames a second, nominal.
+    fn fps(&self) -> f64;
+
+    /// Fill `frame` (width x height bytes) with the next one; `None` at the end.
+    fn next_into(&mut self, frame: &mut [u8]) -> Result<Option<FrameTime>>;
+}
+
+/// Open a replay: a Y4M file, `-` for Y4M on standard input, or a directory of images.
+pub fn open(input: &Path, fps: Option<f64>) -> Result<Box<dyn FrameSource>> {
+    if let Some(fps) = fps
+        && !(0.01..=10_000.0).contains(&fps)
+    {
+        return Err(Error::configuration(format!("--fps {fps}")).allowed("0.01 to 10000"));
+    }
+    if input == Path::new("-") {
+        return Ok(Box::new(Y4m::new(Box::new(std::io::stdin()), "standard input", fps)?));
+    }
+    let metadata = std::fs::metadata(input).map_err(|e| {
+        Error::configuration(format!("cannot open the input: {e}"))
+            .in_file(input)
+            .remedy("give a Y4M file, `-` for standard input, or a directory of images")
+    })?;
+    if metadata.is_dir() {
+        return Ok(Box::new(Directory::open(input, fps)?));
+    }
+    let file = std::fs::File::open(input).map_err(|e| {
+        Error::failure(format!("cannot open the input: {e}")).in_file(input)
+    })?;
+    Ok(Box::new(Y4m::new(Box::new(file), &input.display().to_string(), fps)?))
+}

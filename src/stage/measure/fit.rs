@@ -1,0 +1,339 @@
+//! Fitting the cuboid to a whole pass: damped Gauss-Newton, bounded, without heap.
+//!
+//! First the silhouettes alone (how far the blob reaches in each direction), from several
+//! start heights; then the edges, each profile's step chosen by the model, within a gate that
+//! closes. The silhouettes stay in with low weight: they guard the choice of edges.
+//! Source: Nocedal and Wright, chapter 10; Huber 1964 and Tukey's biweight for outliers.
+
+use super::model::{EDGES, HEIGHT, LENGTH, N, Outline, Params, SCALE, WIDTH, X, Y, YAW, canonical};
+use super::observe::{DIRECTIONS, EdgeSample, View, direction};
+use crate::camera::BeltView;
+use crate::units::BeltRect;
+use nalgebra::{SMatrix, SVector, Vector2};
+
+/// Blobs are good to a few mm: threshold, shadows, morphology.
+const REACH_SIGMA_MM: f64 = 3.0;
+/// When edges are there, blobs only guard.
+const REACH_GUARD_SIGMA_MM: f64 = 12.0;
+/// Edges are good to a third of a pixel; more is modelling error.
+const EDGE_SIGMA_PX: f64 = 0.35;
+/// The gate around a predicted edge, px, closing with the iterations.
+const GATES_PX: [f64; 12] = [7.0, 7.0, 6.0, 5.0, 4.0, 3.0, 2.5, 2.0, 2.0, 2.0, 2.0, 2.0];
+/// A base edge nearer than this to its top edge cannot be told from it.
+const SIDE_DEPTH_MIN_PX: f64 = 4.0;
+/// Profiles on neighbouring places and frames share their errors; this many count as one.
+const CORRELATED_SAMPLES: f64 = 20.0;
+/// Below this no dimension is trusted, mm: lens model, edge rounding.
+const SIGMA_FLOOR_MM: f64 = 0.3;
+/// Dimensions below this are no parcel.
+const SIDE_MIN_MM: f64 = 5.0;
+
+/// What a fit needs besides the views.
+#[derive(Clone, Copy, Debug)]
+pub struct Problem<'a> {
+    /// Belt view geometry.
+    pub geometry: &'a BeltView,
+    /// Only what is over this part of the belt is used.
+    pub zone: &'a BeltRect,
+    /// Upper bound of the height.
+    pub height_max_mm: f64,
+    /// Travel at which X holds.
+    pub reference_travel_mm: f64,
+    /// Relative standard uncertainty of the travel.
+    pub travel_sigma: f64,
+}
+
+/// A fitted cuboid.
+#[derive(Clone, Copy, Debug)]
+pub struct Estimate {
+    /// The parameters, at the reference travel.
+    pub params: Params,
+    /// Standard deviations of the parameters.
+    pub sigma: Params,
+    /// Share of the profiles that have a step at the model's edge, 0 to 1.
+    pub edge_share: f64,
+    /// Profiles used.
+    pub edge_count: usize,
+    /// Weighted mean square of the silhouette residuals, in units of their sigma.
+    pub reach_error: f64,
+}
+
+/// Sums of a least squares problem.
+struct Normal {
+    matrix: SMatrix<f64, N, N>,
+    vector: SVector<f64, N>,
+    cost: f64,
+}
+
+impl Normal {
+    fn new() -> Self {
+        Self { matrix: SMatrix::zeros(), vector: SVector::zeros(), cost: 0.0 }
+    }
+
+    /// Add `weight * residual^2`; `row` is the derivative of the prediction.
+    fn add(&mut self, residual: f64, row: &SVector<f64, N>, weight: f64) {
+        self.matrix.ger(weight, row, row, 1.0);
+        self.vector.axpy(weight * residual, row, 1.0);
+        self.cost += weight * residual * residual;
+    }
+
+    /// Damped step.
+    fn solve(&self, damping: f64) -> Option<SVector<f64, N>> {
+        let mut damped = self.matrix;
+        for i in 0..N {
+            damped[(i, i)] *= 1.0 + damping;
+        }
+        damped.cholesky().map(|c| c.solve(&self.vector))
+    }
+}
+
+/// Statistics of the edges used in one iteration.
+#[derive(Clone, Copy, Debug, Default)]
+struct EdgeUse {
+    offered: usize,
+    used: usize,
+    squares: f64,
+    /// Sum of slopes of the chosen steps, for each edge: its polarity.
+    polarity: [f64; EDGES],
+}
+
+impl Problem<'_> {
+    /// Fit silhouettes only, from `start` or from scratch.
+    pub fn fit_reach(&self, views: &[View], start: Option<Params>) -> Option<Estimate> {
+        let candidates = match start {
+            Some(params) => [Some(params), None, None],
+            None => [0.1, 0.35, 0.75].map(|share| self.start(views, share * self.height_max_mm)),
+        };
+        let mut best: Option<(f64, Params)> = None;
+        for candidate in candidates.into_iter().flatten() {
+            let (cost, params) = self.descend(views, candidate, 8);
+            if cost.is_finite() && best.is_none_or(|(c, _)| cost < c) {
+                best = Some((cost, params));
+            }
+        }
+        let (_, params) = best?;
+        let (normal, reach_error) = self.reach_normal(views, &params, REACH_SIGMA_MM);
+        self.estimate(params, &normal, reach_error, &EdgeUse::default())
+    }
+
+    /// Fit edges, starting from an estimate; `iterations` steps of the closing gate, the last
+    /// ones of it when there are fewer.
+    pub fn fit_edges(&self, views: &[View], start: Params, iterations: usize) -> Option<Estimate> {
+        let mut params = start;
+        let mut polarity = [0.0; EDGES];
+        let gates = &GATES_PX[GATES_PX.len().saturating_sub(iterations)..];
+        let mut last = None;
+        for gate_px in gates {
+            let (mut normal, reach_error) = self.reach_normal(views, &params, REACH_GUARD_SIGMA_MM);
+            let used = self.add_edges(views, &params, gate_px * self.geometry.mm_per_px, &polarity, &mut normal);
+            polarity = used.polarity;
+            params = self.bounded(params, params + normal.solve(1e-6)?);
+            last = Some((normal, reach_error, used));
+        }
+        let (normal, reach_error, used) = last?;
+        self.estimate(params, &normal, reach_error, &used)
+    }
+
+    fn estimate(
+        &self,
+        params: Params,
+        normal: &Normal,
+        reach_error: f64,
+        used: &EdgeUse,
+    ) -> Option<Estimate> {
+        if params.iter().any(|p| !p.is_finite()) {
+            return None;
+        }
+        let covariance = normal.matrix.cholesky()?.inverse();
+        // Residuals larger than assumed widen the result; smaller ones do not narrow it.
+        let edge_sigma = EDGE_SIGMA_PX * self.geometry.mm_per_px;
+        let excess = if used.used > 0 {
+            (used.squares / used.used as f64 / (edge_sigma * edge_sigma)).max(1.0)
+        } else {
+            reach_error.max(1.0)
+        };
+        let scale = (CORRELATED_SAMPLES * excess).sqrt();
+        let mut sigma = covariance.diagonal().map(|v| v.max(0.0).sqrt() * scale);
+        // The travel's own uncertainty is in the prior and is not one of many samples.
+        sigma[SCALE] = covariance[(SCALE, SCALE)].max(0.0).sqrt();
+        for i in [X, Y, LENGTH, WIDTH, HEIGHT] {
+            sigma[i] = sigma[i].hypot(SIGMA_FLOOR_MM);
+        }
+        Some(Estimate {
+            params,
+            sigma,
+            edge_share: if used.offered > 0 { used.used as f64 / used.offered as f64 } else { 0.0 },
+            edge_count: used.used,
+            reach_error,
+        })
+    }
+
+    /// A start from the view that shows the most: the direction of least bounding area.
+    fn start(&self, views: &[View], height_mm: f64) -> Option<Params> {
+        let view = views.iter().max_by_key(|v| v.reach_count())?;
+        let reach = |k: usize| f64::from(view.reach_mm[k % DIRECTIONS]);
+        let extent = |k: usize| reach(k) + reach(k + DIRECTIONS / 2);
+        let quarter = DIRECTIONS / 4;
+        let k = (0..quarter)
+            .filter(|&k| (extent(k) * extent(k + quarter)).is_finite())
+            .min_by(|&a, &b| {
+                (extent(a) * extent(a + quarter)).total_cmp(&(extent(b) * extent(b + quarter)))
+            })?;
+        let middle = |k: usize| 0.5 * (reach(k) - reach(k + DIRECTIONS / 2));
+        let image = direction(k) * middle(k) + direction(k + quarter) * middle(k + quarter);
+        let m = self.geometry.magnification(height_mm);
+        let centre = self.geometry.nadir + (image - self.geometry.nadir) / m;
+        let travel = view.travel_mm - self.reference_travel_mm;
+        let yaw = direction(k).y.atan2(direction(k).x);
+        Some(Params::from([
+            centre.x - travel,
+            centre.y,
+            yaw,
+            (extent(k) / m).max(SIDE_MIN_MM),
+            (extent(k + quarter) / m).max(SIDE_MIN_MM),
+            height_mm,
+            1.0,
+        ]))
+    }
+
+    /// Levenberg-Marquardt on the silhouettes.
+    fn descend(&self, views: &[View], start: Params, iterations: usize) -> (f64, Params) {
+        let (mut params, mut damping) = (start, 1e-3);
+        let (mut normal, _) = self.reach_normal(views, &params, REACH_SIGMA_MM);
+        for _ in 0..iterations {
+            let Some(step) = normal.solve(damping) else { break };
+            let next = self.bounded(params, params + step);
+            let (next_normal, _) = self.reach_normal(views, &next, REACH_SIGMA_MM);
+            if next_normal.cost < normal.cost {
+                (params, normal, damping) = (next, next_normal, damping * 0.2);
+            } else {
+                damping *= 10.0;
+            }
+        }
+        (normal.cost, params)
+    }
+
+    /// Keep a step inside what a parcel can be.
+    fn bounded(&self, from: Params, to: Params) -> Params {
+        let mut to = to;
+        to[YAW] = from[YAW] + (to[YAW] - from[YAW]).clamp(-0.3, 0.3);
+        for i in [LENGTH, WIDTH] {
+            to[i] = to[i].clamp(SIDE_MIN_MM, 20_000.0);
+        }
+        to[HEIGHT] = to[HEIGHT].clamp(0.0, 1.1 * self.height_max_mm);
+        to[SCALE] = to[SCALE].clamp(0.8, 1.25);
+        to
+    }
+
+    /// Silhouette residuals (Huber) and the priors. Also the mean square residual.
+    fn reach_normal(&self, views: &[View], params: &Params, sigma_mm: f64) -> (Normal, f64) {
+        let mut normal = Normal::new();
+        let (mut squares, mut count) = (0.0, 0);
+        for view in views {
+            let outline = Outline::new(self.geometry, params, view.travel_mm - self.reference_travel_mm);
+            for (k, &reach) in view.reach_mm.iter().enumerate().filter(|(_, r)| r.is_finite()) {
+                let d = direction(k);
+                let vertex = outline.support(d);
+                let residual = f64::from(reach) - vertex.image.dot(&d);
+                let row = vertex.jacobian.transpose() * d;
+                let huber = (1.5 * sigma_mm / residual.abs().max(1e-9)).min(1.0);
+                normal.add(residual, &row, huber / (sigma_mm * sigma_mm));
+                squares += huber * residual * residual;
+                count += 1;
+            }
+        }
+        let axis = |i: usize| SVector::<f64, N>::ith(i, 1.0);
+        normal.add(1.0 - params[SCALE], &axis(SCALE), self.travel_sigma.powi(-2));
+        // Keeps the height determined while the baseline is still short.
+        let middle = 0.25 * self.height_max_mm;
+        normal.add(middle - params[HEIGHT], &axis(HEIGHT), (4.0 * middle).powi(-2));
+        let mean_square = squares / f64::from(count.max(1)) / (REACH_SIGMA_MM * REACH_SIGMA_MM);
+        (normal, mean_square)
+    }
+
+    /// Edge residuals (biweight) with the step that each profile offers within the gate.
+    fn add_edges(
+        &self,
+        views: &[View],
+        params: &Params,
+        gate_mm: f64,
+        polarity: &[f64; EDGES],
+        normal: &mut Normal,
+    ) -> EdgeUse {
+        let mut used = EdgeUse::default();
+        let sigma_mm = EDGE_SIGMA_PX * self.geometry.mm_per_px;
+        for view in views.iter().filter(|v| !v.samples().is_empty()) {
+            let outline = Outline::new(self.geometry, params, view.travel_mm - self.reference_travel_mm);
+            let usable: [bool; EDGES] = std::array::from_fn(|e| {
+                let edge = super::model::EdgeId(e as u8);
+                let apart = outline.side_depth_mm(edge.face()) > SIDE_DEPTH_MIN_PX * self.geometry.mm_per_px;
+                outline.visible(edge) && (apart || !edge.is_base())
+            });
+            for sample in view.samples() {
+                let e = usize::from(sample.edge.0);
+                if !usable[e] {
+                    continue;
+                }
+                let Some((at, row)) = self.predict(&outline, sample) else { continue };
+                used.offered += 1;
+                let Some((residual, slope)) = choose(sample, at, gate_mm, polarity[e]) else { continue };
+                used.used += 1;
+                used.squares += residual * residual;
+                used.polarity[e] += f64::from(slope.signum());
+                let share = residual / gate_mm;
+                let biweight = (1.0 - share * share).powi(2);
+                normal.add(residual, &row, biweight / (sigma_mm * sigma_mm));
+            }
+        }
+        used
+    }
+
+    /// Where the model's edge crosses a profile: offset from the anchor along `outward`, and
+    /// its derivative. `None` when the profile misses the edge or that part is not in the zone.
+    fn predict(&self, outline: &Outline, sample: &EdgeSample) -> Option<(f64, SVector<f64, N>)> {
+        let [a, b] = outline.ends(sample.edge);
+        let anchor = Vector2::from(sample.anchor.map(f64::from));
+        let outward = Vector2::from(sample.outward.map(f64::from));
+        let along = b.image - a.image;
+        let length = along.norm();
+        let normal = Vector2::new(along.y, -along.x) / length;
+        let facing = normal.dot(&outward);
+        let t = (anchor - a.image).dot(&along) / (length * length);
+        let x_over_belt = a.over_belt.x + t * (b.over_belt.x - a.over_belt.x);
+        let in_zone = (self.zone.x_min_mm..=self.zone.x_max_mm).contains(&x_over_belt);
+        // Near a corner the neighbouring edge takes over.
+        if !(0.04..=0.96).contains(&t) || facing < 0.9 || !in_zone {
+            return None;
+        }
+        let at = normal.dot(&(a.image - anchor)) / facing;
+        let jacobian = a.jacobian * (1.0 - t) + b.jacobian * t;
+        Some((at, jacobian.transpose() * normal / facing))
+    }
+}
+
+/// The step that belongs to the predicted edge: inside the gate, of the edge's polarity once
+/// that is known, the strongest for its distance. Returns residual and slope.
+fn choose(sample: &EdgeSample, predicted_mm: f64, gate_mm: f64, polarity: f64) -> Option<(f64, f32)> {
+    let mut best: Option<(f64, f64, f32)> = None;
+    for step in sample.steps.iter().filter(|s| s.slope != 0.0) {
+        let residual = f64::from(step.at) - predicted_mm;
+        let near = 1.0 - (residual / gate_mm).powi(2);
+        if near <= 0.0 || f64::from(step.slope) * polarity < 0.0 {
+            continue;
+        }
+        let score = f64::from(step.slope.abs()) * near;
+        if best.is_none_or(|(s, _, _)| score > s) {
+            best = Some((score, residual, step.slope));
+        }
+    }
+    best.map(|(_, residual, slope)| (residual, slope))
+}
+
+/// An estimate's parameters with length >= width, and the sigmas in the same order.
+pub fn canonical_estimate(mut estimate: Estimate) -> Estimate {
+    if estimate.params[LENGTH] < estimate.params[WIDTH] {
+        estimate.sigma.swap_rows(LENGTH, WIDTH);
+    }
+    estimate.params = canonical(estimate.params);
+    estimate
+}

@@ -1,0 +1,202 @@
+//! The known-motion measurement: one cuboid fitted to a parcel's whole pass.
+//!
+//! In: for each frame, a track's runs and the grey belt view, with the belt's travel. Out: an
+//! [`Estimate`] at any time, final when the parcel has left. Owns: the views of every pass.
+//! Limits: `limits.views_per_track_max`; a full pass is thinned to every second view.
+//! Cost: a few 10 us a frame and track; a refit every fourth view; the final fit is a dozen
+//! Gauss-Newton steps.
+
+mod fit;
+mod model;
+mod observe;
+
+pub use fit::Estimate;
+pub use model::{HEIGHT, LENGTH, Outline, Params, SCALE, WIDTH, X, Y, YAW};
+pub use observe::Frame;
+
+use crate::belt::BeltPosition;
+use crate::camera::BeltView;
+use crate::error::Result;
+use crate::kernel::scalar::runs::Run;
+use crate::plan::{Block, Memory, Plan};
+use crate::units::BeltRect;
+use fit::{Problem, canonical_estimate};
+use observe::View;
+
+/// A first estimate needs this many views ...
+const FIRST_FIT_VIEWS: usize = 4;
+/// ... over this much travel, mm: height shows only in motion.
+const FIRST_FIT_TRAVEL_MM: f64 = 50.0;
+/// Directions a view must show to count towards the first estimate.
+const REACH_COUNT_MIN: usize = 24;
+/// Refit after this many new views.
+const REFIT_VIEWS: usize = 4;
+/// Views that a pass over the zone gives, before thinning.
+const VIEWS_PER_ZONE: f64 = 60.0;
+/// Fewer profiles than this cannot carry the fit.
+const EDGE_COUNT_MIN: usize = 60;
+/// Gauss-Newton steps of a refit, and of the final fit.
+const REFIT_STEPS: usize = 4;
+const FINAL_STEPS: usize = 12;
+
+/// State of one track's pass.
+#[derive(Clone, Copy)]
+struct Pass {
+    view_count: usize,
+    /// Views that showed the blob whole.
+    whole_count: usize,
+    first: BeltPosition,
+    last: BeltPosition,
+    view_step_mm: f64,
+    since_fit: usize,
+    estimate: Option<Estimate>,
+}
+
+/// The measuring stage: a pass for every track slot.
+pub struct Measure {
+    geometry: BeltView,
+    zone: BeltRect,
+    height_max_mm: f64,
+    views_per_track: usize,
+    views: Block<View>,
+    passes: Block<Pass>,
+}
+
+impl Measure {
+    /// Memory for `tracks_max` passes.
+    pub fn plan(tracks_max: usize, views_per_track: usize, plan: &mut Plan) {
+        plan.add::<View>(
+            "measure.views",
+            tracks_max * views_per_track,
+            "limits.tracks_max x limits.views_per_track_max",
+        );
+        plan.add::<Pass>("measure.passes", tracks_max, "limits.tracks_max");
+    }
+
+    /// No passes yet.
+    pub fn new(
+        geometry: BeltView,
+        zone: BeltRect,
+        height_max_mm: f64,
+        views_per_track: usize,
+        memory: &mut Memory,
+    ) -> Result<Self> {
+        let empty = Pass {
+            view_count: 0,
+            whole_count: 0,
+            first: BeltPosition::default(),
+            last: BeltPosition::default(),
+            view_step_mm: 0.0,
+            since_fit: 0,
+            estimate: None,
+        };
+        Ok(Self {
+            geometry,
+            zone,
+            height_max_mm,
+            views_per_track,
+            views: memory.take("measure.views", View::EMPTY)?,
+            passes: memory.take("measure.passes", empty)?,
+        })
+    }
+
+    /// Begin a pass.
+    pub fn begin(&mut self, slot: usize, at: BeltPosition) {
+        self.passes[slot] = Pass {
+            view_count: 0,
+            whole_count: 0,
+            first: at,
+            last: BeltPosition { travel_mm: f64::NEG_INFINITY, ..at },
+            view_step_mm: self.zone.length_mm() / VIEWS_PER_ZONE,
+            since_fit: 0,
+            estimate: None,
+        };
+    }
+
+    /// What one frame shows of the parcel. `runs`: its blob, empty when it is not alone.
+    pub fn observe<'r>(
+        &mut self,
+        slot: usize,
+        at: BeltPosition,
+        frame: &Frame<'_>,
+        runs: impl Iterator<Item = &'r Run>,
+    ) {
+        let pass = &mut self.passes[slot];
+        if at.travel_mm - pass.last.travel_mm < pass.view_step_mm {
+            return;
+        }
+        let mut view = View::EMPTY;
+        view.travel_mm = at.travel_mm;
+        view.reach_mm = frame.reach(runs);
+        if let Some(estimate) = &pass.estimate {
+            let travel = at.travel_mm - pass.first.travel_mm;
+            frame.sample_edges(&Outline::new(&self.geometry, &estimate.params, travel), &mut view);
+        }
+        if view.reach_count() == 0 && view.samples().is_empty() {
+            return;
+        }
+        pass.last = at;
+        pass.since_fit += 1;
+        pass.whole_count += usize::from(view.reach_count() >= REACH_COUNT_MIN);
+        let views = &mut self.views[slot * self.views_per_track..][..self.views_per_track];
+        if pass.view_count == views.len() {
+            for i in 0..views.len() / 2 {
+                views[i] = views[2 * i];
+            }
+            pass.view_count = views.len() / 2;
+            pass.view_step_mm *= 2.0;
+        }
+        views[pass.view_count] = view;
+        pass.view_count += 1;
+        self.refit(slot);
+    }
+
+    fn refit(&mut self, slot: usize) {
+        let pass = &self.passes[slot];
+        let travelled = pass.last.travel_mm - pass.first.travel_mm;
+        let ready = match pass.estimate {
+            None => pass.whole_count >= FIRST_FIT_VIEWS && travelled >= FIRST_FIT_TRAVEL_MM,
+            Some(_) => pass.since_fit >= REFIT_VIEWS,
+        };
+        if ready {
+            let estimate = self.fit(slot, REFIT_STEPS);
+            let pass = &mut self.passes[slot];
+            pass.estimate = estimate.or(pass.estimate);
+            pass.since_fit = 0;
+        }
+    }
+
+    fn fit(&self, slot: usize, edge_steps: usize) -> Option<Estimate> {
+        let pass = &self.passes[slot];
+        let views = &self.views[slot * self.views_per_track..][..pass.view_count];
+        let problem = Problem {
+            geometry: &self.geometry,
+            zone: &self.zone,
+            height_max_mm: self.height_max_mm,
+            reference_travel_mm: pass.first.travel_mm,
+            travel_sigma: pass.last.sigma_since(&pass.first),
+        };
+        let profiles: usize = views.iter().map(|v| v.samples().len()).sum();
+        let start = pass.estimate.map(|e| e.params);
+        if profiles < EDGE_COUNT_MIN {
+            return problem.fit_reach(views, start);
+        }
+        let start = start.or_else(|| problem.fit_reach(views, None).map(|e| e.params))?;
+        problem.fit_edges(views, start, edge_steps).filter(|e| e.edge_count >= EDGE_COUNT_MIN)
+    }
+
+    /// The cuboid at belt position `at`, by the current estimate.
+    pub fn outline(&self, slot: usize, at: BeltPosition) -> Option<Outline> {
+        let pass = &self.passes[slot];
+        let estimate = pass.estimate.as_ref()?;
+        Some(Outline::new(&self.geometry, &estimate.params, at.travel_mm - pass.first.travel_mm))
+    }
+
+    /// The final estimate, X at belt position `at`, length >= width.
+    pub fn finish(&mut self, slot: usize, at: BeltPosition) -> Option<Estimate> {
+        let mut estimate = self.fit(slot, FINAL_STEPS).or(self.passes[slot].estimate)?;
+        let travel = at.travel_mm - self.passes[slot].first.travel_mm;
+        estimate.params[X] += estimate.params[SCALE] * travel;
+        Some(canonical_estimate(estimate))
+    }
+}

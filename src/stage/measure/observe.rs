@@ -1,0 +1,181 @@
+//! What one frame tells about one parcel: how far its blob reaches, and where edges are.
+
+use super::model::{EDGES, EdgeId, Outline};
+use crate::camera::BeltView;
+use crate::image::Plane;
+use crate::kernel::scalar::bits::words;
+use crate::kernel::scalar::profile::{Step, sample, steps};
+use crate::kernel::scalar::runs::Run;
+use crate::units::{BeltMm, BeltPx, BeltRect};
+use nalgebra::Vector2;
+
+/// Directions in which the reach of a blob is kept, evenly around the circle.
+pub const DIRECTIONS: usize = 32;
+/// Places on each edge where a profile is taken.
+pub const SAMPLES_PER_EDGE: usize = 10;
+/// Steps kept of one profile.
+pub const STEPS: usize = 3;
+/// Profiles reach this far to both sides of the predicted edge, px.
+const SEARCH_PX: usize = 10;
+/// Profiles are the mean of this many neighbours to both sides.
+const PROFILE_HALF_WIDTH: i32 = 1;
+/// Weaker steps than this, grey levels a px, drown in sensor noise.
+const SLOPE_MIN: f32 = 0.8;
+
+/// Unit vector of direction `k`.
+pub fn direction(k: usize) -> Vector2<f64> {
+    let angle = std::f64::consts::TAU * k as f64 / DIRECTIONS as f64;
+    Vector2::new(angle.cos(), angle.sin())
+}
+
+/// A profile across a predicted edge.
+#[derive(Clone, Copy, Debug)]
+pub struct EdgeSample {
+    /// The edge that was predicted here.
+    pub edge: EdgeId,
+    /// The predicted place, mm on the belt plane.
+    pub anchor: [f32; 2],
+    /// Outward direction of the profile.
+    pub outward: [f32; 2],
+    /// Steps found: offset from the anchor along `outward`, mm; and slope. Unused: slope 0.
+    pub steps: [Step; STEPS],
+}
+
+const NO_SAMPLE: EdgeSample = EdgeSample {
+    edge: EdgeId(0),
+    anchor: [0.0; 2],
+    outward: [0.0; 2],
+    steps: [Step { at: 0.0, slope: 0.0 }; STEPS],
+};
+
+/// One frame's share of a pass.
+#[derive(Clone, Copy, Debug)]
+pub struct View {
+    /// Belt travel since start, mm.
+    pub travel_mm: f64,
+    /// Reach of the blob in each direction, mm on the belt plane; NaN where not seen.
+    pub reach_mm: [f32; DIRECTIONS],
+    /// Edge profiles; empty before a first estimate exists.
+    samples: [EdgeSample; EDGES * SAMPLES_PER_EDGE],
+    sample_count: u8,
+}
+
+impl View {
+    /// Nothing seen.
+    pub const EMPTY: Self = Self {
+        travel_mm: 0.0,
+        reach_mm: [f32::NAN; DIRECTIONS],
+        samples: [NO_SAMPLE; EDGES * SAMPLES_PER_EDGE],
+        sample_count: 0,
+    };
+
+    /// The profiles taken.
+    pub fn samples(&self) -> &[EdgeSample] {
+        &self.samples[..usize::from(self.sample_count)]
+    }
+
+    /// How many directions were seen.
+    pub fn reach_count(&self) -> usize {
+        self.reach_mm.iter().filter(|r| r.is_finite()).count()
+    }
+}
+
+/// Geometry shared by all observations.
+pub struct Frame<'a> {
+    /// Geometry of the belt view.
+    pub view: &'a BeltView,
+    /// The measuring zone.
+    pub zone: &'a BeltRect,
+    /// The grey belt view.
+    pub grey: Plane<'a>,
+    /// Bit-packed: pixels that the camera sees.
+    pub seen: &'a [u64],
+}
+
+impl Frame<'_> {
+    /// Reach of the runs in every direction. A direction whose furthest pixel lies at the
+    /// border of what is seen, or beyond the zone along the belt, tells nothing: the parcel
+    /// may go on there.
+    pub fn reach<'r>(&self, runs: impl Iterator<Item = &'r Run>) -> [f32; DIRECTIONS] {
+        let directions: [Vector2<f64>; DIRECTIONS] = std::array::from_fn(direction);
+        let mut furthest = [(f64::NEG_INFINITY, BeltPx::default()); DIRECTIONS];
+        for run in runs {
+            let v = f64::from(run.v);
+            for u in [f64::from(run.start), f64::from(run.end) - 1.0] {
+                for (d, best) in directions.iter().zip(&mut furthest) {
+                    // v grows to -y
+                    let along = d.x * u - d.y * v;
+                    if along > best.0 {
+                        *best = (along, BeltPx { u, v });
+                    }
+                }
+            }
+        }
+        std::array::from_fn(|k| {
+            let (along, px) = furthest[k];
+            if !along.is_finite() || !self.tells(px) {
+                return f32::NAN;
+            }
+            let at = self.view.belt_point(px);
+            // The blob's border runs half a pixel outside its outermost pixel centres.
+            (directions[k].dot(&Vector2::new(at.x, at.y)) + 0.5 * self.view.mm_per_px) as f32
+        })
+    }
+
+    fn tells(&self, px: BeltPx) -> bool {
+        let at = self.view.belt_point(px);
+        let in_zone = (self.zone.x_min_mm..=self.zone.x_max_mm).contains(&at.x);
+        let [width, height] = self.view.size_px;
+        let (u, v) = (px.u as usize, px.v as usize);
+        let inside = (2..width.saturating_sub(2)).contains(&u) && (2..height.saturating_sub(2)).contains(&v);
+        let is_seen = |u: usize, v: usize| self.seen[v * words(width) + u / 64] >> (u % 64) & 1 == 1;
+        in_zone
+            && inside
+            && [(u - 2, v), (u + 2, v), (u, v - 2), (u, v + 2)].into_iter().all(|(u, v)| is_seen(u, v))
+    }
+
+    /// Take profiles across the visible edges of a predicted outline.
+    pub fn sample_edges(&self, outline: &Outline, into: &mut View) {
+        let mut count = 0;
+        for edge in (0..EDGES as u8).map(EdgeId).filter(|&e| outline.visible(e)) {
+            let ends = outline.ends(edge);
+            for i in 0..SAMPLES_PER_EDGE {
+                let t = (i as f64 + 0.5) / SAMPLES_PER_EDGE as f64;
+                let over_belt_x = ends[0].over_belt.x + t * (ends[1].over_belt.x - ends[0].over_belt.x);
+                if !(self.zone.x_min_mm..=self.zone.x_max_mm).contains(&over_belt_x) {
+                    continue;
+                }
+                let anchor = ends[0].image + (ends[1].image - ends[0].image) * t;
+                if let Some(found) = self.sample_edge(edge, anchor, outline.normals[edge.face()]) {
+                    into.samples[count] = found;
+                    count += 1;
+                }
+            }
+        }
+        into.sample_count = count as u8;
+    }
+
+    /// One profile; `None` where it leaves the view or finds no step.
+    fn sample_edge(&self, edge: EdgeId, anchor: Vector2<f64>, outward: Vector2<f64>) -> Option<EdgeSample> {
+        let px = self.view.px(BeltMm { x: anchor.x, y: anchor.y });
+        // In pixels the y axis points down.
+        let step = [outward.x as f32, -outward.y as f32];
+        let start =
+            [px.u as f32 - SEARCH_PX as f32 * step[0], px.v as f32 - SEARCH_PX as f32 * step[1]];
+        let mut profile = [0.0; 2 * SEARCH_PX + 1];
+        sample(self.grey, start, step, PROFILE_HALF_WIDTH, &mut profile)?;
+        let mut found = NO_SAMPLE.steps;
+        if steps(&profile, SLOPE_MIN, &mut found) == 0 {
+            return None;
+        }
+        for step in found.iter_mut().filter(|s| s.slope != 0.0) {
+            step.at = (step.at - SEARCH_PX as f32) * self.view.mm_per_px as f32;
+        }
+        Some(EdgeSample {
+            edge,
+            anchor: [anchor.x as f32, anchor.y as f32],
+            outward: [outward.x as f32, outward.y as f32],
+            steps: found,
+        })
+    }
+}

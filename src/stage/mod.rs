@@ -1,0 +1,8 @@
+//! The stages of the pipeline: each owns its state, plans its memory and reads no clock.
+
+pub mod background;
+pub mod measure;
+pub mod odometry;
+pub mod rectify;
+pub mod segment;
+pub mod track;

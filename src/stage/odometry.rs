@@ -1,0 +1,229 @@
+//! Belt motion from the belt's own texture: the witness that makes heights possible.
+//!
+//! In: belt view minus background, free belt only. Out: travel since the last frame, whether
+//! it was measured. Owns: the texture of a key frame and of the current one.
+//! The current texture is matched with the key's, not with the last frame's, so errors do
+//! not add up frame by frame; a new key is taken when the overlap gets small. In the belt
+//! view all belt motion is horizontal, so a match is one number.
+//! Cost: one product a pixel of every second zone row for each shift tried, 7 when locked.
+//! Source: normalised cross-correlation with parabola (Tian and Huhns 1986).
+
+use crate::camera::BeltView;
+use crate::error::Result;
+use crate::image::Plane;
+use crate::kernel::scalar::correlate::{NO_TEXTURE, Sums, correlate};
+use crate::plan::{Block, Memory, Plan};
+use crate::stage::background::Background;
+use crate::units::{BeltMm, BeltRect};
+
+/// Every second row carries the texture; neighbouring rows repeat most of it.
+const ROW_STEP: usize = 2;
+/// Texture is stored in 1/16 grey level: a shift of Q8.
+const TEXTURE_SHIFT: u32 = 4;
+/// Differences beyond 7 grey levels are shadows, dirt or parcels, not texture.
+const TEXTURE_MAX: i32 = 112;
+/// When locked, shifts this far around the prediction are tried.
+const LOCKED_SEARCH_PX: f64 = 3.0;
+/// A correlation above this is a match: 200 x 800 px of pure noise stay below 0.02.
+const MATCH_MIN: f64 = 0.08;
+/// Pairs of textured pixels below which a match proves nothing.
+const PAIRS_MIN: u32 = 4000;
+/// A new key when the belt has moved on by this share of the zone.
+const KEY_TRAVEL: f64 = 0.45;
+
+/// What one frame told.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Motion {
+    /// Travel since the last frame, mm.
+    pub step_mm: f64,
+    /// Measured, or assumed from the last known speed.
+    pub measured: bool,
+}
+
+/// The odometry stage.
+pub struct Odometry {
+    mm_per_px: f64,
+    width: usize,
+    /// First and one-past-last column and row of the zone.
+    columns: std::ops::Range<usize>,
+    rows: std::ops::Range<usize>,
+    nominal_mm_per_s: f64,
+    speed_error_max: f64,
+    /// Last known speed.
+    speed_mm_per_s: f64,
+    key: Block<i8>,
+    current: Block<i8>,
+    /// Travel from the key to the last frame, px; `None` before the first key.
+    shift_px: Option<f64>,
+    locked: bool,
+}
+
+struct Match {
+    shift_px: f64,
+    pairs: u32,
+}
+
+impl Odometry {
+    fn zone_px(view: &BeltView, zone: &BeltRect) -> [std::ops::Range<usize>; 2] {
+        let a = view.px(BeltMm { x: zone.x_min_mm, y: zone.y_max_mm });
+        let b = view.px(BeltMm { x: zone.x_max_mm, y: zone.y_min_mm });
+        let range = |from: f64, to: f64, n: usize| {
+            (from.max(0.0) as usize).min(n)..((to.max(0.0) as usize) + 1).min(n)
+        };
+        [range(a.u, b.u, view.size_px[0]), range(a.v, b.v, view.size_px[1])]
+    }
+
+    fn texture_px(view: &BeltView, zone: &BeltRect) -> usize {
+        let [columns, rows] = Self::zone_px(view, zone);
+        columns.len() * rows.len().div_ceil(ROW_STEP)
+    }
+
+    /// Memory for a zone.
+    pub fn plan(view: &BeltView, zone: &BeltRect, plan: &mut Plan) {
+        let n = Self::texture_px(view, zone);
+        plan.add::<i8>("odometry.key", n, "belt texture of the key frame, every second row");
+        plan.add::<i8>("odometry.current", n, "belt texture of the current frame");
+    }
+
+    /// Not yet locked.
+    pub fn new(
+        view: &BeltView,
+        zone: &BeltRect,
+        nominal_mm_per_s: f64,
+        speed_error_max: f64,
+        memory: &mut Memory,
+    ) -> Result<Self> {
+        let [columns, rows] = Self::zone_px(view, zone);
+        Ok(Self {
+            mm_per_px: view.mm_per_px,
+            width: view.size_px[0],
+            columns,
+            rows,
+            nominal_mm_per_s,
+            speed_error_max,
+            speed_mm_per_s: nominal_mm_per_s,
+            key: memory.take("odometry.key", NO_TEXTURE)?,
+            current: memory.take("odometry.current", NO_TEXTURE)?,
+            shift_px: None,
+            locked: false,
+        })
+    }
+
+    /// One frame, `dt_s` after the last one. `covered`: bit mask of pixels that are not belt.
+    pub fn step(
+        &mut self,
+        view: Plane<'_>,
+        background: &Background,
+        covered: &[u64],
+        dt_s: f64,
+    ) -> Motion {
+        self.extract(view, background, covered);
+        let Some(last_px) = self.shift_px else {
+            self.take_key();
+            return Motion { step_mm: self.speed_mm_per_s * dt_s, measured: false };
+        };
+        let found = self.search(last_px, dt_s);
+        self.locked = found.is_some();
+        let assumed_px = self.speed_mm_per_s * dt_s / self.mm_per_px;
+        let step_px = found.as_ref().map_or(assumed_px, |m| m.shift_px - last_px);
+        let step_mm = step_px * self.mm_per_px;
+        match found {
+            Some(m) => {
+                if dt_s > 0.0 {
+                    self.speed_mm_per_s = step_mm / dt_s;
+                }
+                self.shift_px = Some(m.shift_px);
+                let far = m.shift_px.abs() > KEY_TRAVEL * self.columns.len() as f64;
+                if far || m.pairs < PAIRS_MIN * 2 {
+                    self.take_key();
+                }
+            }
+            None => {
+                // The texture is gone: the last good speed is the best guess for a moment,
+                // the nominal speed in the long run.
+                self.speed_mm_per_s += 0.05 * (self.nominal_mm_per_s - self.speed_mm_per_s);
+                self.take_key();
+            }
+        }
+        Motion { step_mm, measured: self.locked }
+    }
+
+    /// Whether the belt is known to stand still (below a tenth of the nominal speed).
+    pub fn stands_still(&self) -> bool {
+        self.locked && self.speed_mm_per_s.abs() < 0.1 * self.nominal_mm_per_s
+    }
+
+    fn take_key(&mut self) {
+        std::mem::swap(&mut self.key, &mut self.current);
+        self.shift_px = Some(0.0);
+    }
+
+    /// Belt texture of the zone: the view minus the background, where it is belt.
+    fn extract(&mut self, view: Plane<'_>, background: &Background, covered: &[u64]) {
+        let words = crate::kernel::scalar::bits::words(self.width);
+        let columns = self.columns.clone();
+        let rows = self.rows.clone().step_by(ROW_STEP);
+        for (v, out) in rows.zip(self.current.chunks_exact_mut(columns.len())) {
+            let grey = &view.row(v)[columns.clone()];
+            let covered = &covered[v * words..(v + 1) * words];
+            for ((u, out), &grey) in columns.clone().zip(out).zip(grey) {
+                let texture = background.difference(grey, v * self.width + u) >> TEXTURE_SHIFT;
+                let is_belt = covered[u / 64] >> (u % 64) & 1 == 0 && texture.abs() <= TEXTURE_MAX;
+                *out = if is_belt { texture as i8 } else { NO_TEXTURE };
+            }
+        }
+    }
+
+    /// The best match: near the prediction when locked, else over every speed from standstill
+    /// to the fastest allowed.
+    fn search(&self, last_px: f64, dt_s: f64) -> Option<Match> {
+        let px_per_frame = |mm_per_s: f64| mm_per_s * dt_s / self.mm_per_px;
+        let predicted = last_px + px_per_frame(self.speed_mm_per_s);
+        let wide = (
+            last_px - 2.0,
+            last_px + px_per_frame(self.nominal_mm_per_s) * (1.0 + self.speed_error_max) + 2.0,
+        );
+        let near = (predicted - LOCKED_SEARCH_PX, predicted + LOCKED_SEARCH_PX);
+        if self.locked
+            && let Some(found) = self.best(near)
+        {
+            return Some(found);
+        }
+        self.best(wide)
+    }
+
+    /// The best interior shift of a range, refined by a parabola.
+    fn best(&self, (from, to): (f64, f64)) -> Option<Match> {
+        let (from, to) = (from.floor() as isize, to.ceil() as isize);
+        let mut best: Option<(isize, f64, u32)> = None;
+        for shift in from..=to {
+            let (rho, pairs) = self.correlation(shift);
+            if pairs >= PAIRS_MIN && best.is_none_or(|(_, r, _)| rho > r) {
+                best = Some((shift, rho, pairs));
+            }
+        }
+        let (shift, rho, pairs) = best?;
+        // A maximum at the end of the range is a slope, not a match.
+        if rho < MATCH_MIN || shift == from || shift == to {
+            return None;
+        }
+        let (before, after) = (self.correlation(shift - 1).0, self.correlation(shift + 1).0);
+        let curvature = before - 2.0 * rho + after;
+        if curvature >= 0.0 {
+            return None;
+        }
+        let offset = (0.5 * (before - after) / curvature).clamp(-0.5, 0.5);
+        Some(Match { shift_px: shift as f64 + offset, pairs })
+    }
+
+    /// Normalised correlation of key and current texture, the belt having moved by `shift`.
+    fn correlation(&self, shift: isize) -> (f64, u32) {
+        let mut sums = Sums::default();
+        let n = self.columns.len();
+        for (key, current) in self.key.chunks_exact(n).zip(self.current.chunks_exact(n)) {
+            correlate(key, current, shift, &mut sums);
+        }
+        let norm = (sums.aa as f64 * sums.bb as f64).sqrt();
+        (if norm > 0.0 { sums.ab as f64 / norm } else { 0.0 }, sums.n)
+    }
+}

@@ -1,0 +1,267 @@
+//! Blobs -> tracks: each parcel carried through the view by the belt's predicted motion.
+//!
+//! In: blobs, travel since the last frame. Out: which track owns which blob; new, lost and
+//! departed tracks. Owns: the track table. Limits: `limits.tracks_max`; a parcel that finds
+//! it full is counted. A track counts only once it has moved with the belt: a ghost in the
+//! background or a hand does not.
+
+use super::segment::{Blob, PxBox};
+use crate::belt::BeltPosition;
+use crate::error::Result;
+use crate::plan::{Block, Memory, Plan};
+
+/// Overlap with the prediction, as a share of the smaller box, that makes a blob a track's.
+const OVERLAP_MIN: f32 = 0.3;
+/// A blob must have followed the belt this far, px, before its track is believed ...
+const CONFIRM_TRAVEL_PX: f64 = 15.0;
+/// ... and by at least this share of the travel.
+const CONFIRM_SHARE: f32 = 0.6;
+/// A track that has not followed the belt over this travel is none, px.
+const GIVE_UP_TRAVEL_PX: f64 = 90.0;
+/// A track unseen over this travel is gone, px.
+const UNSEEN_TRAVEL_PX: f64 = 120.0;
+/// A fragment this young joins an older track instead of being merged with it, frames.
+const YOUNG_FRAMES: u32 = 8;
+
+/// No owner.
+pub const NOBODY: u16 = u16::MAX;
+
+/// Where a track is in its life.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Phase {
+    /// The slot is empty.
+    Free,
+    /// Seen, but not yet known to ride on the belt.
+    Candidate,
+    /// A parcel on its way through the zone.
+    Riding,
+    /// Reported; followed until it is out of view, so that it is not found again.
+    Left,
+}
+
+/// One parcel candidate.
+#[derive(Clone, Copy, Debug)]
+pub struct Track {
+    /// Life phase.
+    pub phase: Phase,
+    /// Box of its blobs, or the prediction while unseen.
+    pub bounds: PxBox,
+    /// Belt position when first seen.
+    pub first: BeltPosition,
+    /// Frames it has been followed.
+    pub frames: u32,
+    /// It shares its blob with another track in this frame.
+    pub merged: bool,
+    /// It did so in any frame.
+    pub ever_merged: bool,
+    /// Travel, px, since it was last seen.
+    unseen_px: f64,
+    first_bounds: PxBox,
+}
+
+const FREE: Track = Track {
+    phase: Phase::Free,
+    bounds: PxBox { u0: 0.0, u1: 0.0, v0: 0.0, v1: 0.0 },
+    first: BeltPosition { travel_mm: 0.0, measured_mm: 0.0 },
+    frames: 0,
+    merged: false,
+    ever_merged: false,
+    unseen_px: 0.0,
+    first_bounds: PxBox { u0: 0.0, u1: 0.0, v0: 0.0, v1: 0.0 },
+};
+
+impl Track {
+    /// Whether the track holds the background under it.
+    pub fn is_parcel(&self) -> bool {
+        matches!(self.phase, Phase::Riding | Phase::Left)
+    }
+
+    /// How far the blob's ends have moved, px: the better of both, as one end may be clipped.
+    fn followed_px(&self) -> f32 {
+        (self.bounds.u0 - self.first_bounds.u0).max(self.bounds.u1 - self.first_bounds.u1)
+    }
+}
+
+/// What happened to a track in a frame.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Change {
+    /// A new candidate in this slot.
+    Began,
+    /// A parcel vanished inside the view; its slot is free again.
+    Lost,
+}
+
+/// The tracking stage.
+pub struct Tracker {
+    mm_per_px: f64,
+    magnification_max: f64,
+    tracks: Block<Track>,
+    owners: Block<u16>,
+    changes: heapless::Vec<(usize, Change), 512>,
+    /// Blobs that found no free track.
+    pub overflows: u64,
+}
+
+impl Tracker {
+    /// Memory for the tables.
+    pub fn plan(tracks_max: usize, blobs_max: usize, plan: &mut Plan) {
+        plan.add::<Track>("track.tracks", tracks_max, "limits.tracks_max");
+        plan.add::<u16>("track.owners", blobs_max, "limits.blobs_max: the track of each blob");
+    }
+
+    /// No tracks.
+    pub fn new(mm_per_px: f64, magnification_max: f64, memory: &mut Memory) -> Result<Self> {
+        Ok(Self {
+            mm_per_px,
+            magnification_max,
+            tracks: memory.take("track.tracks", FREE)?,
+            owners: memory.take("track.owners", NOBODY)?,
+            changes: heapless::Vec::new(),
+            overflows: 0,
+        })
+    }
+
+    /// Carry the tracks on by `step_mm` of belt travel and give them their blobs.
+    pub fn step(&mut self, blobs: &[Blob], step_mm: f64, at: BeltPosition) {
+        self.changes.clear();
+        self.owners.fill(NOBODY);
+        let step_px = step_mm / self.mm_per_px;
+        for track in self.tracks.iter_mut().filter(|t| t.phase != Phase::Free) {
+            // The top moves faster than the belt; a stop is in between.
+            let most = step_px * self.magnification_max;
+            track.bounds = track.bounds.swept(step_px as f32, most as f32);
+            track.merged = false;
+            track.frames = track.frames.saturating_add(1);
+        }
+        for blob in blobs {
+            self.assign(blob);
+        }
+        self.gather(blobs, step_px);
+        for blob in blobs {
+            if self.owners[blob.label as usize] == NOBODY {
+                self.begin(blob, at);
+            }
+        }
+        self.judge(at);
+    }
+
+    /// Give a blob to the track that it overlaps most; several parcels on one blob are merged.
+    fn assign(&mut self, blob: &Blob) {
+        let overlap = |t: &Track| {
+            let smaller = t.bounds.area().min(blob.bounds.area());
+            if t.phase == Phase::Free { 0.0 } else { t.bounds.overlap(&blob.bounds) / smaller }
+        };
+        let claims = |t: &Track| overlap(t) > OVERLAP_MIN;
+        let best = |least_frames: u32| {
+            (0..self.tracks.len())
+                .filter(|&s| claims(&self.tracks[s]) && self.tracks[s].frames >= least_frames)
+                .max_by(|&a, &b| {
+                    let area = |s: usize| self.tracks[s].bounds.overlap(&blob.bounds);
+                    area(a).total_cmp(&area(b))
+                })
+        };
+        let Some(owner) = best(YOUNG_FRAMES).or_else(|| best(0)) else { return };
+        self.owners[blob.label as usize] = owner as u16;
+        let mut shared = false;
+        for s in (0..self.tracks.len()).filter(|&s| s != owner) {
+            let track = &self.tracks[s];
+            if !claims(track) {
+                continue;
+            }
+            if track.frames < YOUNG_FRAMES && track.phase == Phase::Candidate {
+                self.tracks[s].phase = Phase::Free; // a fragment rejoined
+            } else {
+                shared = true;
+                self.tracks[s].merged = true;
+            }
+        }
+        self.tracks[owner].merged |= shared;
+    }
+
+    /// Each track's box becomes that of its blobs; the prediction stands when it has none, or
+    /// shares one.
+    fn gather(&mut self, blobs: &[Blob], step_px: f64) {
+        for s in 0..self.tracks.len() {
+            let track = &mut self.tracks[s];
+            if track.phase == Phase::Free {
+                continue;
+            }
+            let seen = blobs
+                .iter()
+                .filter(|b| self.owners[b.label as usize] == s as u16)
+                .fold(PxBox::default(), |all, b| all.union(&b.bounds));
+            if track.merged {
+                track.ever_merged = true;
+                track.bounds.u1 = track.bounds.u1.min(track.bounds.u1 + step_px as f32);
+                track.unseen_px = 0.0;
+            } else if seen.u0.is_finite() {
+                track.bounds = seen;
+                track.unseen_px = 0.0;
+            } else {
+                track.unseen_px += step_px.abs();
+            }
+        }
+    }
+
+    fn begin(&mut self, blob: &Blob, at: BeltPosition) {
+        let Some(slot) = self.tracks.iter().position(|t| t.phase == Phase::Free) else {
+            self.overflows += 1;
+            return;
+        };
+        self.tracks[slot] = Track {
+            phase: Phase::Candidate,
+            bounds: blob.bounds,
+            first: at,
+            first_bounds: blob.bounds,
+            ..FREE
+        };
+        self.owners[blob.label as usize] = slot as u16;
+        // 256 tracks can begin and be lost once each: 512 changes at most.
+        let _ = self.changes.push((slot, Change::Began));
+    }
+
+    /// Confirm what rides on the belt, drop what does not, free what is out of view.
+    fn judge(&mut self, at: BeltPosition) {
+        for (slot, track) in self.tracks.iter_mut().enumerate() {
+            let travel_px = (at.travel_mm - track.first.travel_mm) / self.mm_per_px;
+            match track.phase {
+                Phase::Free => {}
+                Phase::Candidate => {
+                    let follows = track.followed_px() >= CONFIRM_SHARE * travel_px as f32;
+                    if travel_px >= CONFIRM_TRAVEL_PX && follows && track.unseen_px == 0.0 {
+                        track.phase = Phase::Riding;
+                    } else if travel_px > GIVE_UP_TRAVEL_PX || track.unseen_px > CONFIRM_TRAVEL_PX {
+                        track.phase = Phase::Free;
+                    }
+                }
+                Phase::Riding | Phase::Left if track.unseen_px > UNSEEN_TRAVEL_PX => {
+                    if track.phase == Phase::Riding {
+                        let _ = self.changes.push((slot, Change::Lost));
+                    }
+                    track.phase = Phase::Free;
+                }
+                Phase::Riding | Phase::Left => {}
+            }
+        }
+    }
+
+    /// The track table; a track's slot is its index.
+    pub fn tracks(&self) -> &[Track] {
+        &self.tracks
+    }
+
+    /// The track of each blob label, or [`NOBODY`].
+    pub fn owners(&self) -> &[u16] {
+        &self.owners
+    }
+
+    /// What happened in the last step.
+    pub fn changes(&self) -> &[(usize, Change)] {
+        &self.changes
+    }
+
+    /// A riding parcel was reported.
+    pub fn set_left(&mut self, slot: usize) {
+        self.tracks[slot].phase = Phase::Left;
+    }
+}
