@@ -152,6 +152,7 @@ impl Pipeline {
         let motion =
             self.odometry.step(self.rectify.view(), &self.background, &self.covered, dt_s);
         self.at.advance(motion.step_mm, motion.measured);
+        if std::env::var_os("DBG").is_some() { eprintln!("ODO {} {:.3} {} {:.3} gain {:.4}", time.index, motion.step_mm, motion.measured, self.at.travel_mm, self.background.gain()); }
         self.tracker.step(self.segment.blobs(), motion.step_mm, self.at);
         self.measure_tracks(time);
         self.report(emit);

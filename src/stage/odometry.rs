@@ -31,6 +31,11 @@ const PAIRS_MIN: u32 = 4000;
 /// A new key when the belt has moved on by this share of the zone.
 const KEY_TRAVEL: f64 = 0.45;
 
+/// The speed follows single frames, good to a few tenths of a px, at this rate.
+const SPEED_FOLLOW: f64 = 0.3;
+/// After this many frames without a match the key is given up.
+const MISSES_MAX: u32 = 6;
+
 /// What one frame told.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Motion {
@@ -56,6 +61,8 @@ pub struct Odometry {
     /// Travel from the key to the last frame, px; `None` before the first key.
     shift_px: Option<f64>,
     locked: bool,
+    /// Frames without a match since the last one.
+    misses: u32,
 }
 
 struct Match {
@@ -106,6 +113,7 @@ impl Odometry {
             current: memory.take("odometry.current", NO_TEXTURE)?,
             shift_px: None,
             locked: false,
+            misses: 0,
         })
     }
 
@@ -130,8 +138,9 @@ impl Odometry {
         match found {
             Some(m) => {
                 if dt_s > 0.0 {
-                    self.speed_mm_per_s = step_mm / dt_s;
+                    self.speed_mm_per_s += SPEED_FOLLOW * (step_mm / dt_s - self.speed_mm_per_s);
                 }
+                self.misses = 0;
                 self.shift_px = Some(m.shift_px);
                 let far = m.shift_px.abs() > KEY_TRAVEL * self.columns.len() as f64;
                 if far || m.pairs < PAIRS_MIN * 2 {
@@ -139,10 +148,14 @@ impl Odometry {
                 }
             }
             None => {
-                // The texture is gone: the last good speed is the best guess for a moment,
-                // the nominal speed in the long run.
-                self.speed_mm_per_s += 0.05 * (self.nominal_mm_per_s - self.speed_mm_per_s);
-                self.take_key();
+                self.misses += 1;
+                self.shift_px = Some(last_px + step_px);
+                // A parcel may hide the belt for a moment: the last speed bridges that. When
+                // the texture stays away, only the nominal speed is known.
+                if self.misses >= MISSES_MAX {
+                    self.speed_mm_per_s = self.nominal_mm_per_s;
+                    self.take_key();
+                }
             }
         }
         Motion { step_mm, measured: self.locked }

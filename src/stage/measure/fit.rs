@@ -18,7 +18,18 @@ const REACH_GUARD_SIGMA_MM: f64 = 12.0;
 /// Edges are good to a third of a pixel; more is modelling error.
 const EDGE_SIGMA_PX: f64 = 0.35;
 /// The gate around a predicted edge, px, closing with the iterations.
-const GATES_PX: [f64; 12] = [7.0, 7.0, 6.0, 5.0, 4.0, 3.0, 2.5, 2.0, 2.0, 2.0, 2.0, 2.0];
+const GATES_PX: [f64; 12] = [6.0, 6.0, 5.0, 4.0, 3.0, 2.5, 2.0, 2.0, 2.0, 2.0, 2.0, 2.0];
+/// An edge's polarity is settled once the gate is this narrow, px.
+const POLARITY_GATE_PX: f64 = 5.0;
+/// Votes on where a face's top edge is, relative to the silhouette's: bins of half a pixel,
+/// from well inside (shadows and dark sides widen a silhouette) to a little outside.
+const VOTE_BINS: usize = 60;
+const VOTE_BIN_PX: f64 = 0.5;
+const VOTE_FIRST_PX: f64 = -22.0;
+/// Steeper than this votes no more: a label must not outvote an edge.
+const VOTE_SLOPE_MAX: f32 = 4.0;
+/// The outermost place with this share of the most votes is the edge; stripes lie inside it.
+const VOTE_SHARE: f64 = 0.6;
 /// A base edge nearer than this to its top edge cannot be told from it.
 const SIDE_DEPTH_MIN_PX: f64 = 4.0;
 /// Profiles on neighbouring places and frames share their errors; this many count as one.
@@ -116,22 +127,52 @@ impl Problem<'_> {
         self.estimate(params, &normal, reach_error, &EdgeUse::default())
     }
 
-    /// Fit edges, starting from an estimate; `iterations` steps of the closing gate, the last
-    /// ones of it when there are fewer.
-    pub fn fit_edges(&self, views: &[View], start: Params, iterations: usize) -> Option<Estimate> {
-        let mut params = start;
+    /// Fit edges, starting from an estimate.
+    pub fn fit_edges(&self, views: &[View], start: Params) -> Option<Estimate> {
+        let mut params = self.align(views, start);
         let mut polarity = [0.0; EDGES];
-        let gates = &GATES_PX[GATES_PX.len().saturating_sub(iterations)..];
         let mut last = None;
-        for gate_px in gates {
+        for gate_px in GATES_PX {
             let (mut normal, reach_error) = self.reach_normal(views, &params, REACH_GUARD_SIGMA_MM);
             let used = self.add_edges(views, &params, gate_px * self.geometry.mm_per_px, &polarity, &mut normal);
-            polarity = used.polarity;
+            if gate_px <= POLARITY_GATE_PX {
+                polarity = used.polarity;
+            }
             params = self.bounded(params, params + normal.solve(1e-6)?);
             last = Some((normal, reach_error, used));
         }
         let (normal, reach_error, used) = last?;
         self.estimate(params, &normal, reach_error, &used)
+    }
+
+    /// Move the four faces to where most profiles of the whole pass agree on a top edge.
+    fn align(&self, views: &[View], params: Params) -> Params {
+        let mut votes = [[0.0f64; VOTE_BINS]; 4];
+        for view in views.iter().filter(|v| !v.samples().is_empty()) {
+            let outline = Outline::new(self.geometry, &params, view.travel_mm - self.reference_travel_mm);
+            for sample in view.samples().iter().filter(|s| !s.edge.is_base()) {
+                let Some((at, _)) = self.predict(&outline, sample) else { continue };
+                for step in sample.steps.iter().filter(|s| s.slope != 0.0) {
+                    let offset_px = (f64::from(step.at) - at) / self.geometry.mm_per_px;
+                    let bin = ((offset_px - VOTE_FIRST_PX) / VOTE_BIN_PX).floor();
+                    if (0.0..VOTE_BINS as f64).contains(&bin) {
+                        votes[sample.edge.face()][bin as usize] +=
+                            f64::from(step.slope.clamp(-VOTE_SLOPE_MAX, VOTE_SLOPE_MAX));
+                    }
+                }
+            }
+        }
+        let m = self.geometry.magnification(params[HEIGHT]);
+        let [front, left, back, right] =
+            votes.map(|v| outermost_peak(&v).map_or(0.0, |px| px * self.geometry.mm_per_px / m));
+        let (sin, cos) = params[YAW].sin_cos();
+        let (along, across) = (0.5 * (front - back), 0.5 * (left - right));
+        let mut aligned = params;
+        aligned[LENGTH] += front + back;
+        aligned[WIDTH] += left + right;
+        aligned[X] += cos * along - sin * across;
+        aligned[Y] += sin * along + cos * across;
+        self.bounded(params, aligned)
     }
 
     fn estimate(
@@ -152,13 +193,11 @@ impl Problem<'_> {
         } else {
             reach_error.max(1.0)
         };
-        let scale = (CORRELATED_SAMPLES * excess).sqrt();
-        let mut sigma = covariance.diagonal().map(|v| v.max(0.0).sqrt() * scale);
-        // The travel's own uncertainty is in the prior and is not one of many samples.
-        sigma[SCALE] = covariance[(SCALE, SCALE)].max(0.0).sqrt();
+        let mut sigma = covariance.diagonal().map(|v| (excess * v.max(0.0)).sqrt());
         for i in [X, Y, LENGTH, WIDTH, HEIGHT] {
             sigma[i] = sigma[i].hypot(SIGMA_FLOOR_MM);
         }
+        if std::env::var_os("DBG").is_some() && used.used > 0 { eprintln!("FIT scale {:.5} +- {:.5} H {:.2}+-{:.2} excess {:.2} used {} of {} reach {:.2}", params[SCALE], sigma[SCALE], params[HEIGHT], sigma[HEIGHT], excess, used.used, used.offered, reach_error); }
         Some(Estimate {
             params,
             sigma,
@@ -237,7 +276,7 @@ impl Problem<'_> {
                 let residual = f64::from(reach) - vertex.image.dot(&d);
                 let row = vertex.jacobian.transpose() * d;
                 let huber = (1.5 * sigma_mm / residual.abs().max(1e-9)).min(1.0);
-                normal.add(residual, &row, huber / (sigma_mm * sigma_mm));
+                normal.add(residual, &row, huber / (CORRELATED_SAMPLES * sigma_mm * sigma_mm));
                 squares += huber * residual * residual;
                 count += 1;
             }
@@ -282,7 +321,7 @@ impl Problem<'_> {
                 used.polarity[e] += f64::from(slope.signum());
                 let share = residual / gate_mm;
                 let biweight = (1.0 - share * share).powi(2);
-                normal.add(residual, &row, biweight / (sigma_mm * sigma_mm));
+                normal.add(residual, &row, biweight / (CORRELATED_SAMPLES * sigma_mm * sigma_mm));
             }
         }
         used
@@ -309,6 +348,20 @@ impl Problem<'_> {
         let jacobian = a.jacobian * (1.0 - t) + b.jacobian * t;
         Some((at, jacobian.transpose() * normal / facing))
     }
+}
+
+/// Offset, px, of the outermost place where the signed votes agree; `None` without votes.
+fn outermost_peak(votes: &[f64; VOTE_BINS]) -> Option<f64> {
+    // Neighbours within a pixel and a half are the same edge.
+    let smooth = |i: usize| votes[i - 1..=i + 1].iter().sum::<f64>().abs();
+    let inner = || 1..VOTE_BINS - 1;
+    let most = inner().map(smooth).fold(0.0, f64::max);
+    let peak = inner().rev().find(|&i| {
+        let here = smooth(i);
+        let below = i + 1 == VOTE_BINS - 1 || smooth(i + 1) <= here;
+        most > 0.0 && here >= VOTE_SHARE * most && below && (i == 1 || smooth(i - 1) <= here)
+    })?;
+    Some(VOTE_FIRST_PX + (peak as f64 + 0.5) * VOTE_BIN_PX)
 }
 
 /// The step that belongs to the predicted edge: inside the gate, of the edge's polarity once

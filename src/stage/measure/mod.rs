@@ -35,9 +35,6 @@ const REFIT_VIEWS: usize = 4;
 const VIEWS_PER_ZONE: f64 = 60.0;
 /// Fewer profiles than this cannot carry the fit.
 const EDGE_COUNT_MIN: usize = 60;
-/// Gauss-Newton steps of a refit, and of the final fit.
-const REFIT_STEPS: usize = 4;
-const FINAL_STEPS: usize = 12;
 
 /// State of one track's pass.
 #[derive(Clone, Copy)]
@@ -151,6 +148,8 @@ impl Measure {
         self.refit(slot);
     }
 
+    /// The running estimate, from silhouettes alone: it only has to predict where edges are, and
+    /// cannot lock on to a wrong one.
     fn refit(&mut self, slot: usize) {
         let pass = &self.passes[slot];
         let travelled = pass.last.travel_mm - pass.first.travel_mm;
@@ -159,30 +158,27 @@ impl Measure {
             Some(_) => pass.since_fit >= REFIT_VIEWS,
         };
         if ready {
-            let estimate = self.fit(slot, REFIT_STEPS);
+            let start = pass.estimate.map(|e| e.params);
+            let estimate = self.problem(slot).fit_reach(self.views(slot), start);
             let pass = &mut self.passes[slot];
             pass.estimate = estimate.or(pass.estimate);
             pass.since_fit = 0;
         }
     }
 
-    fn fit(&self, slot: usize, edge_steps: usize) -> Option<Estimate> {
+    fn views(&self, slot: usize) -> &[View] {
+        &self.views[slot * self.views_per_track..][..self.passes[slot].view_count]
+    }
+
+    fn problem(&self, slot: usize) -> Problem<'_> {
         let pass = &self.passes[slot];
-        let views = &self.views[slot * self.views_per_track..][..pass.view_count];
-        let problem = Problem {
+        Problem {
             geometry: &self.geometry,
             zone: &self.zone,
             height_max_mm: self.height_max_mm,
             reference_travel_mm: pass.first.travel_mm,
             travel_sigma: pass.last.sigma_since(&pass.first),
-        };
-        let profiles: usize = views.iter().map(|v| v.samples().len()).sum();
-        let start = pass.estimate.map(|e| e.params);
-        if profiles < EDGE_COUNT_MIN {
-            return problem.fit_reach(views, start);
         }
-        let start = start.or_else(|| problem.fit_reach(views, None).map(|e| e.params))?;
-        problem.fit_edges(views, start, edge_steps).filter(|e| e.edge_count >= EDGE_COUNT_MIN)
     }
 
     /// The cuboid at belt position `at`, by the current estimate.
@@ -192,9 +188,13 @@ impl Measure {
         Some(Outline::new(&self.geometry, &estimate.params, at.travel_mm - pass.first.travel_mm))
     }
 
-    /// The final estimate, X at belt position `at`, length >= width.
+    /// The final estimate, X at belt position `at`, length >= width: silhouettes of the whole
+    /// pass from scratch, then its edges.
     pub fn finish(&mut self, slot: usize, at: BeltPosition) -> Option<Estimate> {
-        let mut estimate = self.fit(slot, FINAL_STEPS).or(self.passes[slot].estimate)?;
+        let (problem, views) = (self.problem(slot), self.views(slot));
+        let reach = problem.fit_reach(views, None).or(self.passes[slot].estimate)?;
+        let edges = problem.fit_edges(views, reach.params);
+        let mut estimate = edges.filter(|e| e.edge_count >= EDGE_COUNT_MIN).unwrap_or(reach);
         let travel = at.travel_mm - self.passes[slot].first.travel_mm;
         estimate.params[X] += estimate.params[SCALE] * travel;
         Some(canonical_estimate(estimate))

@@ -12,11 +12,11 @@ use nalgebra::Vector2;
 /// Directions in which the reach of a blob is kept, evenly around the circle.
 pub const DIRECTIONS: usize = 32;
 /// Places on each edge where a profile is taken.
-pub const SAMPLES_PER_EDGE: usize = 10;
+pub const SAMPLES_PER_EDGE: usize = 8;
 /// Steps kept of one profile.
-pub const STEPS: usize = 3;
+pub const STEPS: usize = 6;
 /// Profiles reach this far to both sides of the predicted edge, px.
-const SEARCH_PX: usize = 10;
+const SEARCH_PX: usize = 24;
 /// Profiles are the mean of this many neighbours to both sides.
 const PROFILE_HALF_WIDTH: i32 = 1;
 /// Weaker steps than this, grey levels a px, drown in sensor noise.
