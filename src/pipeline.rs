@@ -25,8 +25,11 @@ const BOX_EDGE_SHARE_MIN: f64 = 0.5;
 const HEIGHT_SIGMA_MAX_MM: f64 = 3.0;
 /// Above this relative sigma the belt speed counts as assumed.
 const SPEED_SIGMA_MAX: f64 = 0.01;
-/// The mask is widened this often before it keeps belt texture and learning away.
-const COVER_DILATIONS: usize = 2;
+/// Around a parcel this many px are not learned as background: the next frame's parcel.
+const HOLD_MARGIN_PX: usize = 2;
+/// Around a parcel this many px are no witness of the belt's motion: blur and compression
+/// carry the parcel's own, faster motion into them.
+const COVER_MARGIN_PX: usize = 8;
 
 /// When and where a track passed the middle of the zone.
 #[derive(Clone, Copy)]
@@ -199,13 +202,14 @@ impl Pipeline {
                 set_bits(&mut self.hold[usize::from(run.v) * n..][..n], run.start, run.end);
             }
         }
-        widen(&mut self.hold, &mut self.scratch, width);
+        widen(&mut self.hold, &mut self.scratch, width, HOLD_MARGIN_PX);
     }
 
-    /// What is not free belt: all foreground, widened by the shadows around it.
+    /// What is not free belt: every blob with its surroundings.
     fn cover(&mut self) {
-        self.covered.copy_from_slice(self.background.foreground());
-        widen(&mut self.covered, &mut self.scratch, self.site.view.size_px[0]);
+        self.covered.copy_from_slice(self.segment.mask());
+        let width = self.site.view.size_px[0];
+        widen(&mut self.covered, &mut self.scratch, width, COVER_MARGIN_PX);
         for (covered, seen) in self.covered.iter_mut().zip(self.rectify.seen()) {
             *covered |= !seen;
         }
@@ -342,8 +346,8 @@ impl Pipeline {
 }
 
 /// Dilate a mask of rows of `width` pixels.
-fn widen(mask: &mut Block<u64>, scratch: &mut Block<u64>, width: usize) {
-    for _ in 0..COVER_DILATIONS {
+fn widen(mask: &mut Block<u64>, scratch: &mut Block<u64>, width: usize, times: usize) {
+    for _ in 0..times {
         dilate3x3(mask, scratch, width);
         std::mem::swap(mask, scratch);
     }

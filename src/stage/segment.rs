@@ -167,6 +167,11 @@ impl Segment {
         &self.blobs[..self.blob_count]
     }
 
+    /// Bit mask after opening and closing.
+    pub fn mask(&self) -> &[u64] {
+        &self.mask
+    }
+
     /// All runs, row by row.
     pub fn runs(&self) -> &[Run] {
         &self.runs[..self.run_count]
