@@ -29,7 +29,7 @@ const VOTE_FIRST_PX: f64 = -22.0;
 /// Steeper than this votes no more: a label must not outvote an edge.
 const VOTE_SLOPE_MAX: f32 = 4.0;
 /// The outermost place with this share of the most votes is the edge; stripes lie inside it.
-const VOTE_SHARE: f64 = 0.6;
+const VOTE_SHARE: f64 = 0.85;
 /// A base edge nearer than this to its top edge cannot be told from it.
 const SIDE_DEPTH_MIN_PX: f64 = 4.0;
 /// Profiles on neighbouring places and frames share their errors; this many count as one.
