@@ -158,6 +158,8 @@ impl Pipeline {
         if std::env::var_os("DBG").is_some() { eprintln!("ODO {} {:.3} {} {:.3} gain {:.4}", time.index, motion.step_mm, motion.measured, self.at.travel_mm, self.background.gain()); }
         self.tracker.step(self.segment.blobs(), motion.step_mm, self.at);
         self.measure_tracks(time);
+        #[cfg(debug_dump)]
+        self.dump(time.index);
         self.report(emit);
         self.counters.segment_overflows = self.segment.overflows;
         self.counters.track_overflows = self.tracker.overflows;
@@ -228,6 +230,7 @@ impl Pipeline {
             zone: &self.zone,
             grey: self.rectify.view(),
             seen: self.rectify.seen(),
+            dark: self.background.dark(),
         };
         let middle_mm = self.zone.centre().x;
         for (slot, track) in self.tracker.tracks().iter().enumerate() {
@@ -357,5 +360,29 @@ fn widen(mask: &mut Block<u64>, scratch: &mut Block<u64>, width: usize, times: u
 fn set_bits(row: &mut [u64], start: u16, end: u16) {
     for u in usize::from(start)..usize::from(end) {
         row[u / 64] |= 1 << (u % 64);
+    }
+}
+#[cfg(debug_dump)]
+impl Pipeline {
+    pub fn dump(&self, index: u64) {
+        let dir = std::env::var("DBGDIR").unwrap();
+        let [w, h] = self.site.view.size_px;
+        let mut rgb = Vec::with_capacity(w * h * 3);
+        let n = words(w);
+        for v in 0..h { for u in 0..w {
+            let g = self.rectify.view().at(u, v);
+            let m = self.segment.mask()[v * n + u / 64] >> (u % 64) & 1 == 1;
+            let f = self.background.foreground()[v * n + u / 64] >> (u % 64) & 1 == 1;
+            rgb.extend([if m { g / 2 + 127 } else { g }, if f { g / 2 + 127 } else { g }, g]);
+        }}
+        for (k, t) in self.tracker.tracks().iter().enumerate() {
+            if t.phase == Phase::Free { continue; }
+            let c = match t.phase { Phase::Candidate => [255, 255, 0], Phase::Riding => [0, 255, 0], _ => [0, 0, 255] };
+            let _ = k;
+            let b = t.bounds;
+            for u in b.u0.max(0.0) as usize..=(b.u1.max(0.0) as usize).min(w - 1) { for v in [b.v0 as usize, (b.v1 as usize).min(h - 1)] { rgb[3 * (v * w + u)..][..3].copy_from_slice(&c); } }
+            for v in b.v0.max(0.0) as usize..=(b.v1 as usize).min(h - 1) { for u in [(b.u0.max(0.0) as usize).min(w - 1), (b.u1.max(0.0) as usize).min(w - 1)] { rgb[3 * (v * w + u)..][..3].copy_from_slice(&c); } }
+        }
+        image::save_buffer(format!("{dir}/d{index:04}.png"), &rgb, w as u32, h as u32, image::ColorType::Rgb8).unwrap();
     }
 }

@@ -96,11 +96,14 @@ pub struct Background {
     pub threshold_sigma: f64,
     /// Darker than the belt by no more than this factor is a shadow.
     pub shadow_ratio_min: f64,
+    /// Darker still by no more than this factor is a dark parcel or a deep shadow; the
+    /// measurement decides which.
+    pub deep_shadow_ratio_min: f64,
 }
 
 impl Default for Background {
     fn default() -> Self {
-        Self { learn_frames: 15, history_frames: 500, threshold_sigma: 4.0, shadow_ratio_min: 0.72 }
+        Self { learn_frames: 15, history_frames: 500, threshold_sigma: 4.0, shadow_ratio_min: 0.72, deep_shadow_ratio_min: 0.3 }
     }
 }
 
@@ -224,6 +227,8 @@ impl Config {
         count("background.history_frames", background.history_frames as usize, 20, 20_000)?;
         range("background.threshold_sigma", background.threshold_sigma, 1.0, 10.0, "")?;
         range("background.shadow_ratio_min", background.shadow_ratio_min, 0.1, 1.0, "")?;
+        let deep = background.deep_shadow_ratio_min;
+        range("background.deep_shadow_ratio_min", deep, 0.0, background.shadow_ratio_min, "")?;
         count("segment.open_px", segment.open_px, 0, 10)?;
         count("segment.close_px", segment.close_px, 0, 30)?;
         range("segment.area_min_mm2", segment.area_min_mm2, 1.0, 1e6, "mm2")?;

@@ -1,7 +1,8 @@
 //! Belt view -> foreground mask, by an incremental Gaussian mixture that follows the light.
 //!
 //! In: belt view; pixels to hold (parcels, or everything while the belt stands). Out: bit
-//! mask of the foreground, shadows excluded; the belt's mean brightness. Owns: the model.
+//! masks of the foreground, shadows excluded, and of its dark part, which may be deep shadow;
+//! the belt's mean brightness. Owns: the model.
 //! A common factor on all pixels (lamp flicker, drift, exposure) is estimated each frame from
 //! a coarse grid and divided out, so that a light change does not flood the mask.
 
@@ -42,6 +43,7 @@ pub struct Background {
     settings: Settings,
     modes: [Mode; MODES],
     foreground: Block<u64>,
+    dark: Block<u64>,
     gain_histogram: Block<u32>,
     /// Model brightness over scene brightness, Q12.
     gain: u32,
@@ -55,6 +57,7 @@ impl Background {
             plan.add::<u16>(name, width * height, "mixture model, one plane a mode and value");
         }
         plan.add::<u64>("background.foreground", words(width) * height, "bit: foreground");
+        plan.add::<u64>("background.dark", words(width) * height, "bit: foreground or deep shadow");
         plan.add::<u32>("background.gain", GAIN_BINS, "histogram of brightness ratios");
     }
 
@@ -73,6 +76,7 @@ impl Background {
             settings,
             modes,
             foreground: memory.take("background.foreground", 0)?,
+            dark: memory.take("background.dark", 0)?,
             gain_histogram: memory.take("background.gain", 0)?,
             gain: GAIN_ONE,
             frames: 0,
@@ -98,7 +102,9 @@ impl Background {
                     variance: &mut m.variance[pixels.clone()],
                 });
                 let hold = hold[word] | !seen[word];
-                self.foreground[word] = update(grey, &mut modes, hold, &params) & seen[word];
+                let masks = update(grey, &mut modes, hold, &params);
+                self.foreground[word] = masks.foreground & seen[word];
+                self.dark[word] = masks.dark & seen[word];
             }
         }
     }
@@ -113,6 +119,7 @@ impl Background {
             background_d2: (sigma * sigma * 256.0) as u32,
             background_share: 58982, // 0.9
             shadow_ratio: (self.settings.shadow_ratio_min * 256.0) as u32,
+            dark_ratio: (self.settings.deep_shadow_ratio_min * 256.0) as u32,
         }
     }
 
@@ -164,6 +171,11 @@ impl Background {
     /// Bit mask of the foreground.
     pub fn foreground(&self) -> &[u64] {
         &self.foreground
+    }
+
+    /// Bit mask of its dark part.
+    pub fn dark(&self) -> &[u64] {
+        &self.dark
     }
 
     /// Model brightness over scene brightness.

@@ -31,6 +31,8 @@ const PAIRS_MIN: u32 = 4000;
 /// A new key when the belt has moved on by this share of the zone.
 const KEY_TRAVEL: f64 = 0.45;
 
+/// Below this share of the nominal speed the belt counts as slow: stopping or starting.
+const SLOW: f64 = 0.3;
 /// The speed follows single frames, good to a few tenths of a px, at this rate.
 const SPEED_FOLLOW: f64 = 0.3;
 /// After this many frames without a match the key is given up.
@@ -187,26 +189,27 @@ impl Odometry {
         }
     }
 
-    /// The best match: near the prediction when locked, else over every speed from standstill
-    /// to the fastest allowed.
+    /// The best match: near the prediction when locked on a moving belt, else over every speed
+    /// from standstill to the fastest allowed. What does not move with the belt (light, dirt
+    /// on the lens, exposure) correlates at standstill, so motion wins over standstill
+    /// wherever it is seen at all.
     fn search(&self, last_px: f64, dt_s: f64) -> Option<Match> {
-        let px_per_frame = |mm_per_s: f64| mm_per_s * dt_s / self.mm_per_px;
-        let predicted = last_px + px_per_frame(self.speed_mm_per_s);
-        let wide = (
-            last_px - 2.0,
-            last_px + px_per_frame(self.nominal_mm_per_s) * (1.0 + self.speed_error_max) + 2.0,
-        );
-        let near = (predicted - LOCKED_SEARCH_PX, predicted + LOCKED_SEARCH_PX);
-        if self.locked
-            && let Some(found) = self.best(near)
-        {
-            return Some(found);
+        let px = |mm_per_s: f64| mm_per_s * dt_s / self.mm_per_px;
+        let slow = px(SLOW * self.nominal_mm_per_s);
+        let predicted = last_px + px(self.speed_mm_per_s);
+        if self.locked && self.speed_mm_per_s > SLOW * self.nominal_mm_per_s {
+            let near = self.best(predicted - LOCKED_SEARCH_PX, predicted + LOCKED_SEARCH_PX);
+            if near.is_some() {
+                return near;
+            }
         }
-        self.best(wide)
+        let fastest = px(self.nominal_mm_per_s) * (1.0 + self.speed_error_max);
+        self.best(last_px + slow, last_px + fastest + 2.0)
+            .or_else(|| self.best(last_px - 2.0, last_px + slow + 1.0))
     }
 
     /// The best interior shift of a range, refined by a parabola.
-    fn best(&self, (from, to): (f64, f64)) -> Option<Match> {
+    fn best(&self, from: f64, to: f64) -> Option<Match> {
         let (from, to) = (from.floor() as isize, to.ceil() as isize);
         let mut best: Option<(isize, f64, u32)> = None;
         for shift in from..=to {
@@ -216,6 +219,7 @@ impl Odometry {
             }
         }
         let (shift, rho, pairs) = best?;
+        if std::env::var_os("DBG").is_some() { eprintln!("  best {from} {to}: {shift} {rho:.3} {pairs}"); }
         // A maximum at the end of the range is a slope, not a match.
         if rho < MATCH_MIN || shift == from || shift == to {
             return None;

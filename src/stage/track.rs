@@ -23,6 +23,11 @@ const UNSEEN_TRAVEL_PX: f64 = 120.0;
 /// A fragment this young joins an older track instead of being merged with it, frames.
 const YOUNG_FRAMES: u32 = 8;
 
+/// A smaller track inside a larger one's blob for this many frames is a piece of it.
+const FRAGMENT_FRAMES: u32 = 8;
+/// Inside means this share of its box.
+const INSIDE_SHARE: f32 = 0.8;
+
 /// No owner.
 pub const NOBODY: u16 = u16::MAX;
 
@@ -54,6 +59,8 @@ pub struct Track {
     pub merged: bool,
     /// It did so in any frame.
     pub ever_merged: bool,
+    /// Frames on end that it has been inside a larger track's blob.
+    inside_frames: u32,
     /// Travel, px, since it was last seen.
     unseen_px: f64,
     first_bounds: PxBox,
@@ -66,6 +73,7 @@ const FREE: Track = Track {
     frames: 0,
     merged: false,
     ever_merged: false,
+    inside_frames: 0,
     unseen_px: 0.0,
     first_bounds: PxBox { u0: 0.0, u1: 0.0, v0: 0.0, v1: 0.0 },
 };
@@ -127,8 +135,10 @@ impl Tracker {
         self.owners.fill(NOBODY);
         let step_px = step_mm / self.mm_per_px;
         for track in self.tracks.iter_mut().filter(|t| t.phase != Phase::Free) {
-            // The top moves faster than the belt; a stop is in between.
-            let most = step_px * self.magnification_max;
+            // The top moves faster than the belt. While nothing is seen of the parcel itself
+            // the belt's own motion is the guess that does not grow.
+            let hidden = track.merged || track.unseen_px > 0.0;
+            let most = if hidden { step_px } else { step_px * self.magnification_max };
             track.bounds = track.bounds.swept(step_px as f32, most as f32);
             track.merged = false;
             track.frames = track.frames.saturating_add(1);
@@ -164,15 +174,19 @@ impl Tracker {
         self.owners[blob.label as usize] = owner as u16;
         let mut shared = false;
         for s in (0..self.tracks.len()).filter(|&s| s != owner) {
-            let track = &self.tracks[s];
-            if !claims(track) {
+            if !claims(&self.tracks[s]) {
                 continue;
             }
-            if track.frames < YOUNG_FRAMES && track.phase == Phase::Candidate {
-                self.tracks[s].phase = Phase::Free; // a fragment rejoined
+            let larger = self.tracks[owner].bounds.union(&blob.bounds);
+            let track = &mut self.tracks[s];
+            let inside = larger.overlap(&track.bounds) >= INSIDE_SHARE * track.bounds.area();
+            track.inside_frames = if inside { track.inside_frames + 1 } else { 0 };
+            let young = track.frames < YOUNG_FRAMES && track.phase == Phase::Candidate;
+            if young || track.inside_frames >= FRAGMENT_FRAMES {
+                track.phase = Phase::Free; // a piece rejoined
             } else {
-                shared = true;
-                self.tracks[s].merged = true;
+                track.merged = true;
+                shared |= !inside;
             }
         }
         self.tracks[owner].merged |= shared;
@@ -192,7 +206,6 @@ impl Tracker {
                 .fold(PxBox::default(), |all, b| all.union(&b.bounds));
             if track.merged {
                 track.ever_merged = true;
-                track.bounds.u1 = track.bounds.u1.min(track.bounds.u1 + step_px as f32);
                 track.unseen_px = 0.0;
             } else if seen.u0.is_finite() {
                 track.bounds = seen;

@@ -35,6 +35,8 @@ pub struct Params {
     pub background_share: u32,
     /// Shadow when at least this fraction of the background, Q8.
     pub shadow_ratio: u32,
+    /// Darker than a shadow, but possibly a deep one, when at least this fraction, Q8.
+    pub dark_ratio: u32,
 }
 
 /// Variance of a new mode: 5 grey levels squared, Q8.
@@ -53,6 +55,8 @@ pub enum Class {
     Background,
     /// Darker than the background by no more than the shadow ratio.
     Shadow,
+    /// Darker still, by no more than the dark ratio: a dark parcel or a deep shadow.
+    Dark,
     /// Anything else.
     Foreground,
 }
@@ -62,21 +66,31 @@ pub fn observation(grey: u8, gain: u32) -> u16 {
     ((u32::from(grey) * gain) >> 4).min(65535) as u16
 }
 
-/// Classify and learn 64 pixels or fewer; bit i of the result: pixel i is foreground.
+/// Bits of 64 pixels.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub struct Masks {
+    /// Foreground, dark pixels included.
+    pub foreground: u64,
+    /// Dark pixels.
+    pub dark: u64,
+}
+
+/// Classify and learn 64 pixels or fewer; bit i of the result is pixel i.
 ///
 /// Pixels whose bit in `hold` is set are classified but not learned. All slices have the
 /// same length, at most 64.
-pub fn update(grey: &[u8], modes: &mut [ModeRow<'_>; MODES], hold: u64, params: &Params) -> u64 {
-    let mut foreground = 0;
+pub fn update(grey: &[u8], modes: &mut [ModeRow<'_>; MODES], hold: u64, params: &Params) -> Masks {
+    let mut masks = Masks::default();
     for (i, &value) in grey.iter().enumerate() {
         let x = observation(value, params.gain);
         let class = classify(x, modes, i, params);
-        foreground |= u64::from(class == Class::Foreground) << i;
+        masks.foreground |= u64::from(matches!(class, Class::Foreground | Class::Dark)) << i;
+        masks.dark |= u64::from(class == Class::Dark) << i;
         if hold >> i & 1 == 0 {
             learn(x, modes, i, params);
         }
     }
-    foreground
+    masks
 }
 
 /// Squared difference in Q16; 65535^2 fits.
@@ -100,9 +114,13 @@ pub fn classify(x: u16, modes: &[ModeRow<'_>; MODES], i: usize, params: &Params)
         if within(x, mean, mode.variance[i], params.background_d2) {
             return Class::Background;
         }
-        let ratio_kept = u32::from(x) << 8 >= params.shadow_ratio * u32::from(mean);
-        if x < mean && ratio_kept && mean >= SHADOW_MEAN_MIN {
-            class = Class::Shadow;
+        let keeps = |ratio: u32| u32::from(x) << 8 >= ratio * u32::from(mean);
+        if x < mean && mean >= SHADOW_MEAN_MIN {
+            if keeps(params.shadow_ratio) {
+                class = Class::Shadow;
+            } else if keeps(params.dark_ratio) && class == Class::Foreground {
+                class = Class::Dark;
+            }
         }
         share += u32::from(weight);
     }
@@ -187,13 +205,14 @@ mod tests {
                 background_d2: 16 << 8,
                 background_share: 58982,
                 shadow_ratio: 184,
+                dark_ratio: 77,
             };
             let mut rows = self.0.each_mut().map(|[weight, mean, variance]| ModeRow {
                 weight: std::slice::from_mut(weight),
                 mean: std::slice::from_mut(mean),
                 variance: std::slice::from_mut(variance),
             });
-            update(&[grey], &mut rows, hold, &params) == 1
+            update(&[grey], &mut rows, hold, &params).foreground == 1
         }
 
         fn learned(grey: u8) -> Self {

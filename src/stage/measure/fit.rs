@@ -52,6 +52,17 @@ pub struct Problem<'a> {
     pub reference_travel_mm: f64,
     /// Relative standard uncertainty of the travel.
     pub travel_sigma: f64,
+    /// Which silhouettes: of the whole blob, or without its dark parts.
+    pub silhouette: Silhouette,
+}
+
+/// Which of a view's reaches.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Silhouette {
+    /// The whole blob: right for dark parcels.
+    Whole,
+    /// Without dark parts: right for bright parcels with deep shadows.
+    Bright,
 }
 
 /// A fitted cuboid.
@@ -65,6 +76,8 @@ pub struct Estimate {
     pub edge_share: f64,
     /// Profiles used.
     pub edge_count: usize,
+    /// Contrast found where the model has edges: what tells a right fit from a wrong one.
+    pub edge_contrast: f64,
     /// Weighted mean square of the silhouette residuals, in units of their sigma.
     pub reach_error: f64,
 }
@@ -104,6 +117,7 @@ struct EdgeUse {
     offered: usize,
     used: usize,
     squares: f64,
+    contrast: f64,
     /// Sum of slopes of the chosen steps, for each edge: its polarity.
     polarity: [f64; EDGES],
 }
@@ -203,6 +217,7 @@ impl Problem<'_> {
             sigma,
             edge_share: if used.offered > 0 { used.used as f64 / used.offered as f64 } else { 0.0 },
             edge_count: used.used,
+            edge_contrast: used.contrast,
             reach_error,
         })
     }
@@ -210,7 +225,7 @@ impl Problem<'_> {
     /// A start from the view that shows the most: the direction of least bounding area.
     fn start(&self, views: &[View], height_mm: f64) -> Option<Params> {
         let view = views.iter().max_by_key(|v| v.reach_count())?;
-        let reach = |k: usize| f64::from(view.reach_mm[k % DIRECTIONS]);
+        let reach = |k: usize| f64::from(view.reach_mm[self.silhouette as usize][k % DIRECTIONS]);
         let extent = |k: usize| reach(k) + reach(k + DIRECTIONS / 2);
         let quarter = DIRECTIONS / 4;
         let k = (0..quarter)
@@ -270,7 +285,7 @@ impl Problem<'_> {
         let (mut squares, mut count) = (0.0, 0);
         for view in views {
             let outline = Outline::new(self.geometry, params, view.travel_mm - self.reference_travel_mm);
-            for (k, &reach) in view.reach_mm.iter().enumerate().filter(|(_, r)| r.is_finite()) {
+            for (k, &reach) in view.reach_mm[self.silhouette as usize].iter().enumerate().filter(|(_, r)| r.is_finite()) {
                 let d = direction(k);
                 let vertex = outline.support(d);
                 let residual = f64::from(reach) - vertex.image.dot(&d);
@@ -321,6 +336,7 @@ impl Problem<'_> {
                 used.polarity[e] += f64::from(slope.signum());
                 let share = residual / gate_mm;
                 let biweight = (1.0 - share * share).powi(2);
+                used.contrast += biweight * f64::from(slope.abs().min(VOTE_SLOPE_MAX));
                 normal.add(residual, &row, biweight / (CORRELATED_SAMPLES * sigma_mm * sigma_mm));
             }
         }

@@ -20,7 +20,7 @@ use crate::error::Result;
 use crate::kernel::scalar::runs::Run;
 use crate::plan::{Block, Memory, Plan};
 use crate::units::BeltRect;
-use fit::{Problem, canonical_estimate};
+use fit::{Problem, Silhouette, canonical_estimate};
 use observe::View;
 
 /// A first estimate needs this many views ...
@@ -159,7 +159,7 @@ impl Measure {
         };
         if ready {
             let start = pass.estimate.map(|e| e.params);
-            let estimate = self.problem(slot).fit_reach(self.views(slot), start);
+            let estimate = self.problem(slot, Silhouette::Whole).fit_reach(self.views(slot), start);
             let pass = &mut self.passes[slot];
             pass.estimate = estimate.or(pass.estimate);
             pass.since_fit = 0;
@@ -170,7 +170,7 @@ impl Measure {
         &self.views[slot * self.views_per_track..][..self.passes[slot].view_count]
     }
 
-    fn problem(&self, slot: usize) -> Problem<'_> {
+    fn problem(&self, slot: usize, silhouette: Silhouette) -> Problem<'_> {
         let pass = &self.passes[slot];
         Problem {
             geometry: &self.geometry,
@@ -178,6 +178,7 @@ impl Measure {
             height_max_mm: self.height_max_mm,
             reference_travel_mm: pass.first.travel_mm,
             travel_sigma: pass.last.sigma_since(&pass.first),
+            silhouette,
         }
     }
 
@@ -188,15 +189,24 @@ impl Measure {
         Some(Outline::new(&self.geometry, &estimate.params, at.travel_mm - pass.first.travel_mm))
     }
 
-    /// The final estimate, X at belt position `at`, length >= width: silhouettes of the whole
-    /// pass from scratch, then its edges.
+    /// The final estimate, X at belt position `at`, length >= width: of the whole blob and of
+    /// its bright part, the cuboid whose edges show more contrast.
     pub fn finish(&mut self, slot: usize, at: BeltPosition) -> Option<Estimate> {
-        let (problem, views) = (self.problem(slot), self.views(slot));
-        let reach = problem.fit_reach(views, None).or(self.passes[slot].estimate)?;
-        let edges = problem.fit_edges(views, reach.params);
-        let mut estimate = edges.filter(|e| e.edge_count >= EDGE_COUNT_MIN).unwrap_or(reach);
+        let whole = self.fit(slot, Silhouette::Whole);
+        let bright = self.fit(slot, Silhouette::Bright);
+        let contrast = |e: &Option<Estimate>| e.map_or(-1.0, |e| e.edge_contrast);
+        let best = if contrast(&bright) > contrast(&whole) { bright } else { whole };
+        let mut estimate = best.or(self.passes[slot].estimate)?;
         let travel = at.travel_mm - self.passes[slot].first.travel_mm;
         estimate.params[X] += estimate.params[SCALE] * travel;
         Some(canonical_estimate(estimate))
+    }
+
+    /// Silhouettes of the whole pass from scratch, then its edges.
+    fn fit(&self, slot: usize, silhouette: Silhouette) -> Option<Estimate> {
+        let (problem, views) = (self.problem(slot, silhouette), self.views(slot));
+        let reach = problem.fit_reach(views, None)?;
+        let edges = problem.fit_edges(views, reach.params);
+        Some(edges.filter(|e| e.edge_count >= EDGE_COUNT_MIN).unwrap_or(reach))
     }
 }

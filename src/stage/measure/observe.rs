@@ -53,8 +53,9 @@ const NO_SAMPLE: EdgeSample = EdgeSample {
 pub struct View {
     /// Belt travel since start, mm.
     pub travel_mm: f64,
-    /// Reach of the blob in each direction, mm on the belt plane; NaN where not seen.
-    pub reach_mm: [f32; DIRECTIONS],
+    /// Reach of the blob in each direction, mm on the belt plane; NaN where not seen. First of
+    /// the whole blob, then of it without its dark parts, which may be shadow.
+    pub reach_mm: [[f32; DIRECTIONS]; 2],
     /// Edge profiles; empty before a first estimate exists.
     samples: [EdgeSample; EDGES * SAMPLES_PER_EDGE],
     sample_count: u8,
@@ -64,7 +65,7 @@ impl View {
     /// Nothing seen.
     pub const EMPTY: Self = Self {
         travel_mm: 0.0,
-        reach_mm: [f32::NAN; DIRECTIONS],
+        reach_mm: [[f32::NAN; DIRECTIONS]; 2],
         samples: [NO_SAMPLE; EDGES * SAMPLES_PER_EDGE],
         sample_count: 0,
     };
@@ -76,7 +77,32 @@ impl View {
 
     /// How many directions were seen.
     pub fn reach_count(&self) -> usize {
-        self.reach_mm.iter().filter(|r| r.is_finite()).count()
+        self.reach_mm[0].iter().filter(|r| r.is_finite()).count()
+    }
+}
+
+/// The furthest pixel in each direction so far.
+struct Furthest {
+    directions: [Vector2<f64>; DIRECTIONS],
+    at: [(f64, BeltPx); DIRECTIONS],
+}
+
+impl Furthest {
+    fn new() -> Self {
+        let at = [(f64::NEG_INFINITY, BeltPx::default()); DIRECTIONS];
+        Self { directions: std::array::from_fn(direction), at }
+    }
+
+    fn add(&mut self, v: u16, start: u16, end: u16) {
+        let v = f64::from(v);
+        for u in [f64::from(start), f64::from(end) - 1.0] {
+            for (d, best) in self.directions.iter().zip(&mut self.at) {
+                let along = d.x * u - d.y * v; // v grows to -y
+                if along > best.0 {
+                    *best = (along, BeltPx { u, v });
+                }
+            }
+        }
     }
 }
 
@@ -90,36 +116,47 @@ pub struct Frame<'a> {
     pub grey: Plane<'a>,
     /// Bit-packed: pixels that the camera sees.
     pub seen: &'a [u64],
+    /// Bit-packed: foreground that may be a deep shadow.
+    pub dark: &'a [u64],
 }
 
 impl Frame<'_> {
-    /// Reach of the runs in every direction. A direction whose furthest pixel lies at the
-    /// border of what is seen, or beyond the zone along the belt, tells nothing: the parcel
-    /// may go on there.
-    pub fn reach<'r>(&self, runs: impl Iterator<Item = &'r Run>) -> [f32; DIRECTIONS] {
-        let directions: [Vector2<f64>; DIRECTIONS] = std::array::from_fn(direction);
-        let mut furthest = [(f64::NEG_INFINITY, BeltPx::default()); DIRECTIONS];
+    /// Reach of the runs in every direction, whole and without their dark ends. A direction
+    /// whose furthest pixel lies at the border of what is seen, or beyond the zone along the
+    /// belt, tells nothing: the parcel may go on there.
+    pub fn reach<'r>(&self, runs: impl Iterator<Item = &'r Run>) -> [[f32; DIRECTIONS]; 2] {
+        let mut whole = Furthest::new();
+        let mut bright = Furthest::new();
         for run in runs {
-            let v = f64::from(run.v);
-            for u in [f64::from(run.start), f64::from(run.end) - 1.0] {
-                for (d, best) in directions.iter().zip(&mut furthest) {
-                    // v grows to -y
-                    let along = d.x * u - d.y * v;
-                    if along > best.0 {
-                        *best = (along, BeltPx { u, v });
-                    }
-                }
+            whole.add(run.v, run.start, run.end);
+            if let Some((start, end)) = self.without_dark_ends(run) {
+                bright.add(run.v, start, end);
             }
         }
+        [self.reach_of(&whole), self.reach_of(&bright)]
+    }
+
+    fn reach_of(&self, furthest: &Furthest) -> [f32; DIRECTIONS] {
         std::array::from_fn(|k| {
-            let (along, px) = furthest[k];
+            let (along, px) = furthest.at[k];
             if !along.is_finite() || !self.tells(px) {
                 return f32::NAN;
             }
             let at = self.view.belt_point(px);
             // The blob's border runs half a pixel outside its outermost pixel centres.
-            (directions[k].dot(&Vector2::new(at.x, at.y)) + 0.5 * self.view.mm_per_px) as f32
+            (direction(k).dot(&Vector2::new(at.x, at.y)) + 0.5 * self.view.mm_per_px) as f32
         })
+    }
+
+    /// A run between its first and last stretch of three pixels that are not dark.
+    fn without_dark_ends(&self, run: &Run) -> Option<(u16, u16)> {
+        let row = &self.dark[usize::from(run.v) * words(self.view.size_px[0])..];
+        let bright = |u: u16| row[usize::from(u) / 64] >> (u % 64) & 1 == 0;
+        let stretch = |u: &u16| (*u..*u + 3).all(bright);
+        let mut places = run.start..run.end.saturating_sub(2);
+        let first = places.find(stretch)?;
+        let last = (first..run.end - 2).rfind(stretch)?;
+        Some((first, last + 3))
     }
 
     fn tells(&self, px: BeltPx) -> bool {
