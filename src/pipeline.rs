@@ -150,7 +150,7 @@ impl Pipeline {
         if !self.background.learned() {
             return Ok(());
         }
-        self.segment.step(self.background.foreground());
+        self.segment.step(self.background.foreground(), self.background.strong());
         self.cover();
         let motion =
             self.odometry.step(self.rectify.view(), &self.background, &self.covered, dt_s);

@@ -8,6 +8,9 @@ use super::Camera;
 use crate::units::{BeltMm, BeltPx, BeltRect};
 use nalgebra::{Vector2, Vector3};
 
+/// Around the zone this many px are kept: edges at its border need their surroundings.
+const MARGIN_PX: f64 = 30.0;
+
 /// Geometry of the belt view. Row 0 is the left edge of the belt seen along travel.
 #[derive(Clone, Debug, PartialEq)]
 pub struct BeltView {
@@ -29,12 +32,13 @@ impl BeltView {
     pub fn covering(camera: &Camera, zone: &BeltRect, height_max_mm: f64, mm_per_px: f64) -> Self {
         let centre = camera.centre_in_belt();
         let (nadir, camera_height_mm) = (Vector2::new(centre.x, centre.y), centre.z);
+        let margin_mm = MARGIN_PX * mm_per_px;
         let magnification = camera_height_mm / (camera_height_mm - height_max_mm);
         let away = |edge_mm: f64, nadir_mm: f64| nadir_mm + magnification * (edge_mm - nadir_mm);
-        let x_min = zone.x_min_mm.min(away(zone.x_min_mm, nadir.x));
-        let x_max = zone.x_max_mm.max(away(zone.x_max_mm, nadir.x));
-        let y_min = zone.y_min_mm.min(away(zone.y_min_mm, nadir.y));
-        let y_max = zone.y_max_mm.max(away(zone.y_max_mm, nadir.y));
+        let x_min = zone.x_min_mm.min(away(zone.x_min_mm, nadir.x)) - margin_mm;
+        let x_max = zone.x_max_mm.max(away(zone.x_max_mm, nadir.x)) + margin_mm;
+        let y_min = zone.y_min_mm.min(away(zone.y_min_mm, nadir.y)) - margin_mm;
+        let y_max = zone.y_max_mm.max(away(zone.y_max_mm, nadir.y)) + margin_mm;
         let count = |length_mm: f64| (length_mm / mm_per_px).ceil() as usize + 1;
         let full = Self {
             size_px: [count(x_max - x_min), count(y_max - y_min)],

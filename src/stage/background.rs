@@ -44,6 +44,7 @@ pub struct Background {
     modes: [Mode; MODES],
     foreground: Block<u64>,
     dark: Block<u64>,
+    strong: Block<u64>,
     gain_histogram: Block<u32>,
     /// Model brightness over scene brightness, Q12.
     gain: u32,
@@ -58,6 +59,7 @@ impl Background {
         }
         plan.add::<u64>("background.foreground", words(width) * height, "bit: foreground");
         plan.add::<u64>("background.dark", words(width) * height, "bit: foreground or deep shadow");
+        plan.add::<u64>("background.strong", words(width) * height, "bit: far from the background");
         plan.add::<u32>("background.gain", GAIN_BINS, "histogram of brightness ratios");
     }
 
@@ -77,6 +79,7 @@ impl Background {
             modes,
             foreground: memory.take("background.foreground", 0)?,
             dark: memory.take("background.dark", 0)?,
+            strong: memory.take("background.strong", 0)?,
             gain_histogram: memory.take("background.gain", 0)?,
             gain: GAIN_ONE,
             frames: 0,
@@ -105,6 +108,7 @@ impl Background {
                 let masks = update(grey, &mut modes, hold, &params);
                 self.foreground[word] = masks.foreground & seen[word];
                 self.dark[word] = masks.dark & seen[word];
+                self.strong[word] = masks.strong & seen[word];
             }
         }
     }
@@ -176,6 +180,11 @@ impl Background {
     /// Bit mask of its dark part.
     pub fn dark(&self) -> &[u64] {
         &self.dark
+    }
+
+    /// Bit mask of the foreground that is beyond doubt.
+    pub fn strong(&self) -> &[u64] {
+        &self.strong
     }
 
     /// Model brightness over scene brightness.

@@ -9,6 +9,9 @@ use crate::kernel::scalar::bits::{dilate3x3, erode3x3, words};
 use crate::kernel::scalar::runs::{Run, collect, resolve};
 use crate::plan::{Block, Memory, Plan};
 
+/// A blob with less of its area far from the background is a stain or a reflection.
+const STRONG_SHARE_MIN: f64 = 0.1;
+
 /// A connected piece of foreground, in belt view pixels.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
 pub struct Blob {
@@ -16,6 +19,8 @@ pub struct Blob {
     pub label: u32,
     /// Pixels.
     pub area_px: u32,
+    /// Pixels far from the background: stains on the belt have few.
+    pub strong_px: u32,
     /// Bounding box.
     pub bounds: PxBox,
 }
@@ -116,8 +121,8 @@ impl Segment {
         })
     }
 
-    /// Segment one mask.
-    pub fn step(&mut self, foreground: &[u64]) {
+    /// Segment one mask; `strong` is its part that is beyond doubt.
+    pub fn step(&mut self, foreground: &[u64], strong: &[u64]) {
         self.mask.copy_from_slice(foreground);
         let (open, close) = (self.settings.open_px, self.settings.close_px);
         self.repeat(erode3x3, open);
@@ -126,7 +131,7 @@ impl Segment {
         let found = collect(&self.mask, self.size_px[0], &mut self.runs);
         self.run_count = found.min(self.runs.len());
         let labels = resolve(&mut self.runs[..self.run_count]);
-        self.gather_blobs(labels);
+        self.gather_blobs(labels, strong);
         if found > self.runs.len() || labels > self.blobs.len() {
             self.overflows += 1;
         }
@@ -140,7 +145,7 @@ impl Segment {
         }
     }
 
-    fn gather_blobs(&mut self, labels: usize) {
+    fn gather_blobs(&mut self, labels: usize, strong: &[u64]) {
         let count = labels.min(self.blobs.len());
         let blobs = &mut self.blobs[..count];
         for (label, blob) in blobs.iter_mut().enumerate() {
@@ -150,11 +155,14 @@ impl Segment {
             let Some(blob) = blobs.get_mut(run.label as usize) else { continue };
             let (v, u0, u1) = (f32::from(run.v), f32::from(run.start), f32::from(run.end) - 1.0);
             blob.area_px += u32::from(run.end - run.start);
+            let row = &strong[usize::from(run.v) * words(self.size_px[0])..];
+            blob.strong_px += count_bits(row, run.start, run.end);
             blob.bounds = blob.bounds.union(&PxBox { u0, u1, v0: v, v1: v });
         }
         let mut kept = 0;
         for i in 0..count {
-            if blobs[i].area_px >= self.area_min_px {
+            let beyond_doubt = f64::from(blobs[i].strong_px) >= STRONG_SHARE_MIN * f64::from(blobs[i].area_px);
+            if blobs[i].area_px >= self.area_min_px && beyond_doubt {
                 blobs[kept] = blobs[i];
                 kept += 1;
             }
@@ -175,5 +183,41 @@ impl Segment {
     /// All runs, row by row.
     pub fn runs(&self) -> &[Run] {
         &self.runs[..self.run_count]
+    }
+}
+
+/// Set bits of `row[start..end]`.
+fn count_bits(row: &[u64], start: u16, end: u16) -> u32 {
+    let (first, last) = (usize::from(start) / 64, usize::from(end - 1) / 64);
+    let from = u64::MAX << (start % 64);
+    let to = u64::MAX >> (63 - (end - 1) % 64);
+    (first..=last)
+        .map(|w| {
+            let mask = if w == first { from } else { u64::MAX } & if w == last { to } else { u64::MAX };
+            (row[w] & mask).count_ones()
+        })
+        .sum()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn bits_are_counted_across_words() {
+        let row = [u64::MAX, 0b1011, u64::MAX];
+        assert_eq!(count_bits(&row, 0, 64), 64);
+        assert_eq!(count_bits(&row, 60, 66), 6);
+        assert_eq!(count_bits(&row, 66, 67), 0);
+        assert_eq!(count_bits(&row, 63, 129), 1 + 3 + 1);
+    }
+
+    #[test]
+    fn boxes_overlap_where_they_share_pixels() {
+        let a = PxBox { u0: 0.0, u1: 9.0, v0: 0.0, v1: 9.0 };
+        let b = PxBox { u0: 9.0, u1: 12.0, v0: 5.0, v1: 20.0 };
+        assert_eq!((a.area(), a.overlap(&b), b.overlap(&a)), (100.0, 5.0, 5.0));
+        assert_eq!(a.overlap(&a.swept(20.0, 20.0)), 0.0);
+        assert_eq!(a.union(&PxBox::default()), a);
     }
 }

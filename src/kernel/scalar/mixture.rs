@@ -73,6 +73,8 @@ pub struct Masks {
     pub foreground: u64,
     /// Dark pixels.
     pub dark: u64,
+    /// Foreground at twice the distance that makes a pixel foreground.
+    pub strong: u64,
 }
 
 /// Classify and learn 64 pixels or fewer; bit i of the result is pixel i.
@@ -86,6 +88,11 @@ pub fn update(grey: &[u8], modes: &mut [ModeRow<'_>; MODES], hold: u64, params: 
         let class = classify(x, modes, i, params);
         masks.foreground |= u64::from(matches!(class, Class::Foreground | Class::Dark)) << i;
         masks.dark |= u64::from(class == Class::Dark) << i;
+        if class != Class::Background && class != Class::Shadow {
+            let far = 4 * params.background_d2;
+            let strong = !within(x, modes[0].mean[i], modes[0].variance[i], far);
+            masks.strong |= u64::from(strong) << i;
+        }
         if hold >> i & 1 == 0 {
             learn(x, modes, i, params);
         }

@@ -224,7 +224,7 @@ impl Problem<'_> {
 
     /// A start from the view that shows the most: the direction of least bounding area.
     fn start(&self, views: &[View], height_mm: f64) -> Option<Params> {
-        let view = views.iter().max_by_key(|v| v.reach_count())?;
+        let view = views.iter().max_by_key(|v| v.reach_count()[self.silhouette as usize])?;
         let reach = |k: usize| f64::from(view.reach_mm[self.silhouette as usize][k % DIRECTIONS]);
         let extent = |k: usize| reach(k) + reach(k + DIRECTIONS / 2);
         let quarter = DIRECTIONS / 4;

@@ -40,8 +40,8 @@ const EDGE_COUNT_MIN: usize = 60;
 #[derive(Clone, Copy)]
 struct Pass {
     view_count: usize,
-    /// Views that showed the blob whole.
-    whole_count: usize,
+    /// Views that showed the blob from nearly all sides: whole, and without dark parts.
+    clear_count: [usize; 2],
     first: BeltPosition,
     last: BeltPosition,
     view_step_mm: f64,
@@ -80,7 +80,7 @@ impl Measure {
     ) -> Result<Self> {
         let empty = Pass {
             view_count: 0,
-            whole_count: 0,
+            clear_count: [0; 2],
             first: BeltPosition::default(),
             last: BeltPosition::default(),
             view_step_mm: 0.0,
@@ -101,7 +101,7 @@ impl Measure {
     pub fn begin(&mut self, slot: usize, at: BeltPosition) {
         self.passes[slot] = Pass {
             view_count: 0,
-            whole_count: 0,
+            clear_count: [0; 2],
             first: at,
             last: BeltPosition { travel_mm: f64::NEG_INFINITY, ..at },
             view_step_mm: self.zone.length_mm() / VIEWS_PER_ZONE,
@@ -129,12 +129,15 @@ impl Measure {
             let travel = at.travel_mm - pass.first.travel_mm;
             frame.sample_edges(&Outline::new(&self.geometry, &estimate.params, travel), &mut view);
         }
-        if view.reach_count() == 0 && view.samples().is_empty() {
+        let reach_count = view.reach_count();
+        if reach_count == [0; 2] && view.samples().is_empty() {
             return;
         }
         pass.last = at;
         pass.since_fit += 1;
-        pass.whole_count += usize::from(view.reach_count() >= REACH_COUNT_MIN);
+        for (clear, reach) in pass.clear_count.iter_mut().zip(reach_count) {
+            *clear += usize::from(reach >= REACH_COUNT_MIN);
+        }
         let views = &mut self.views[slot * self.views_per_track..][..self.views_per_track];
         if pass.view_count == views.len() {
             for i in 0..views.len() / 2 {
@@ -154,12 +157,19 @@ impl Measure {
         let pass = &self.passes[slot];
         let travelled = pass.last.travel_mm - pass.first.travel_mm;
         let ready = match pass.estimate {
-            None => pass.whole_count >= FIRST_FIT_VIEWS && travelled >= FIRST_FIT_TRAVEL_MM,
+            None => {
+                let clear = pass.clear_count[0].max(pass.clear_count[1]);
+                clear >= FIRST_FIT_VIEWS && travelled >= FIRST_FIT_TRAVEL_MM
+            }
             Some(_) => pass.since_fit >= REFIT_VIEWS,
         };
         if ready {
             let start = pass.estimate.map(|e| e.params);
-            let estimate = self.problem(slot, Silhouette::Whole).fit_reach(self.views(slot), start);
+            // A shadow that runs out of sight leaves the whole blob without an end.
+            let [whole, bright] = pass.clear_count;
+            let silhouette =
+                if 2 * whole >= bright { Silhouette::Whole } else { Silhouette::Bright };
+            let estimate = self.problem(slot, silhouette).fit_reach(self.views(slot), start);
             let pass = &mut self.passes[slot];
             pass.estimate = estimate.or(pass.estimate);
             pass.since_fit = 0;

@@ -75,9 +75,9 @@ impl View {
         &self.samples[..usize::from(self.sample_count)]
     }
 
-    /// How many directions were seen.
-    pub fn reach_count(&self) -> usize {
-        self.reach_mm[0].iter().filter(|r| r.is_finite()).count()
+    /// How many directions were seen, for both silhouettes.
+    pub fn reach_count(&self) -> [usize; 2] {
+        self.reach_mm.map(|reach| reach.iter().filter(|r| r.is_finite()).count())
     }
 }
 
