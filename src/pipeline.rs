@@ -283,7 +283,10 @@ impl Pipeline {
 
     fn emit(&mut self, slot: usize, flags: Flags, emit: &mut dyn FnMut(ParcelRecord)) {
         let reference = self.references[slot];
-        let Some(estimate) = self.measure.finish(slot, reference.at) else {
+        let estimate = self.measure.finish(slot, reference.at);
+        // An unfinished pass counts only if it could be measured.
+        let estimate = estimate.filter(|e| e.edge_count > 0 || !flags.has(Flags::UNFINISHED));
+        let Some(estimate) = estimate else {
             self.counters.unmeasured += 1;
             return;
         };

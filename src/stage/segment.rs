@@ -10,7 +10,7 @@ use crate::kernel::scalar::runs::{Run, collect, resolve};
 use crate::plan::{Block, Memory, Plan};
 
 /// A blob with less of its area far from the background is a stain or a reflection.
-const STRONG_SHARE_MIN: f64 = 0.1;
+const STRONG_SHARE_MIN: f64 = 0.3;
 
 /// A connected piece of foreground, in belt view pixels.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
