@@ -31,6 +31,7 @@ pub mod image;
 pub mod kernel;
 pub mod pipeline;
 pub mod plan;
+pub mod plc;
 pub mod run;
 pub mod source;
 pub mod stage;

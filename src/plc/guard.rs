@@ -1,0 +1,144 @@
+//! Stands between a client's socket and the Modbus library.
+//!
+//! Only requests that the server supports, whole and of the right length, get through; all
+//! others get the exception that the protocol names, here. A client that is silent, slow or
+//! not speaking Modbus is disconnected. The library then never sees malformed input.
+//! Source: MODBUS Application Protocol V1.1b3 and Messaging on TCP/IP V1.0b.
+
+use std::time::Duration;
+use tokio::io::{AsyncRead, AsyncReadExt, AsyncWrite, AsyncWriteExt};
+use tokio::time::timeout;
+
+/// MBAP header with unit identifier.
+const HEADER_BYTES: usize = 7;
+/// Largest PDU of the protocol.
+const PDU_BYTES_MAX: usize = 253;
+/// A request, once begun, must be complete, and an answer taken, within this time.
+const EXCHANGE_TIMEOUT: Duration = Duration::from_secs(5);
+
+const READ_HOLDING: u8 = 3;
+const READ_INPUT: u8 = 4;
+/// Registers in one request, by the protocol.
+const READ_COUNT_MAX: u16 = 125;
+
+const ILLEGAL_FUNCTION: u8 = 1;
+const ILLEGAL_DATA_VALUE: u8 = 3;
+
+/// What to do with a request PDU.
+#[derive(Debug, PartialEq, Eq)]
+enum Verdict {
+    Forward,
+    Refuse(u8),
+}
+
+fn judge(pdu: &[u8]) -> Verdict {
+    match *pdu {
+        [READ_HOLDING | READ_INPUT, _, _, high, low] => {
+            match u16::from_be_bytes([high, low]) {
+                1..=READ_COUNT_MAX => Verdict::Forward,
+                _ => Verdict::Refuse(ILLEGAL_DATA_VALUE),
+            }
+        }
+        [READ_HOLDING | READ_INPUT, ..] => Verdict::Refuse(ILLEGAL_DATA_VALUE),
+        _ => Verdict::Refuse(ILLEGAL_FUNCTION),
+    }
+}
+
+/// Serve one client until it leaves, is silent for `idle`, or breaks the protocol.
+/// `library` is the other end of what the Modbus library reads and writes.
+pub async fn serve<C, L>(mut client: C, mut library: L, idle: Duration) -> std::io::Result<()>
+where
+    C: AsyncRead + AsyncWrite + Unpin,
+    L: AsyncRead + AsyncWrite + Unpin,
+{
+    let mut frame = [0; HEADER_BYTES + PDU_BYTES_MAX];
+    loop {
+        if timeout(idle, client.read_exact(&mut frame[..1])).await?.is_err() {
+            return Ok(()); // the client has left
+        }
+        let length = timeout(EXCHANGE_TIMEOUT, read_rest(&mut client, &mut frame, 1)).await??;
+        let answer = match judge(&frame[HEADER_BYTES..length]) {
+            Verdict::Forward => {
+                library.write_all(&frame[..length]).await?;
+                timeout(EXCHANGE_TIMEOUT, read_rest(&mut library, &mut frame, 0)).await??
+            }
+            Verdict::Refuse(code) => refuse(&mut frame, code),
+        };
+        timeout(EXCHANGE_TIMEOUT, client.write_all(&frame[..answer])).await??;
+    }
+}
+
+/// Complete a frame of which `have` bytes are there; returns its length.
+async fn read_rest<R: AsyncRead + Unpin>(
+    reader: &mut R,
+    frame: &mut [u8],
+    have: usize,
+) -> std::io::Result<usize> {
+    reader.read_exact(&mut frame[have..HEADER_BYTES]).await?;
+    let protocol = u16::from_be_bytes([frame[2], frame[3]]);
+    // The length counts the unit identifier, the header's last byte.
+    let pdu_bytes = usize::from(u16::from_be_bytes([frame[4], frame[5]])).saturating_sub(1);
+    if protocol != 0 || !(1..=PDU_BYTES_MAX).contains(&pdu_bytes) {
+        // Where the next frame begins cannot be known: only a new connection helps.
+        return Err(std::io::Error::new(std::io::ErrorKind::InvalidData, "not Modbus TCP"));
+    }
+    let length = HEADER_BYTES + pdu_bytes;
+    reader.read_exact(&mut frame[HEADER_BYTES..length]).await?;
+    Ok(length)
+}
+
+/// Turn the request into its exception response; returns its length.
+fn refuse(frame: &mut [u8], code: u8) -> usize {
+    frame[4..6].copy_from_slice(&3u16.to_be_bytes());
+    frame[HEADER_BYTES] |= 0x80;
+    frame[HEADER_BYTES + 1] = code;
+    HEADER_BYTES + 2
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn only_whole_reads_of_1_to_125_registers_pass() {
+        assert_eq!(judge(&[3, 0, 0, 0, 1]), Verdict::Forward);
+        assert_eq!(judge(&[4, 255, 255, 0, 125]), Verdict::Forward);
+        for pdu in [&[3, 0, 0, 0, 0][..], &[3, 0, 0, 0, 126], &[3, 0, 0, 255, 255], &[3], &[4, 0, 0, 0, 1, 9]] {
+            assert_eq!(judge(pdu), Verdict::Refuse(ILLEGAL_DATA_VALUE), "{pdu:?}");
+        }
+        for function in (0..=255).filter(|f| ![READ_HOLDING, READ_INPUT].contains(f)) {
+            assert_eq!(judge(&[function, 0, 0, 0, 1]), Verdict::Refuse(ILLEGAL_FUNCTION));
+        }
+    }
+
+    /// Send bytes to a guard with no library behind it; returns what it answers.
+    fn answer(bytes: &[u8]) -> Vec<u8> {
+        let runtime = tokio::runtime::Builder::new_current_thread().enable_all().build().expect("runtime");
+        runtime.block_on(async {
+            let (mut client, guarded) = tokio::io::duplex(1024);
+            let (library, _other) = tokio::io::duplex(1024);
+            let guard = tokio::spawn(serve(guarded, library, Duration::from_secs(1)));
+            client.write_all(bytes).await.expect("written");
+            client.shutdown().await.expect("shut");
+            let mut answer = Vec::new();
+            client.read_to_end(&mut answer).await.expect("read");
+            drop(guard);
+            answer
+        })
+    }
+
+    #[test]
+    fn a_write_is_answered_with_illegal_function_and_its_transaction() {
+        let request = [0x12, 0x34, 0, 0, 0, 6, 9, 6, 0, 0, 0, 1];
+        assert_eq!(answer(&request), [0x12, 0x34, 0, 0, 0, 3, 9, 0x86, 1]);
+    }
+
+    #[test]
+    fn what_is_not_modbus_is_disconnected_without_an_answer() {
+        assert_eq!(answer(b"GET / HTTP/1.1\r\n\r\n"), []);
+        assert_eq!(answer(&[0, 1, 0, 0, 0, 0, 1]), [], "length 0");
+        assert_eq!(answer(&[0, 1, 0, 0, 0, 1, 1]), [], "no function code");
+        assert_eq!(answer(&[0, 1, 0, 0, 0xff, 0xff, 1]), [], "longer than any PDU");
+        assert_eq!(answer(&[0, 1, 0, 0, 0, 6, 1, 3]), [], "cut off");
+    }
+}
