@@ -3,8 +3,10 @@
 use beltgauge::config::Site;
 use beltgauge::error::Result;
 use beltgauge::run::offline::{self, Outputs};
-use beltgauge::{pipeline, source};
+use beltgauge::run::demo;
+use beltgauge::{run, source};
 use clap::{Parser, Subcommand};
+use std::net::SocketAddr;
 use std::path::PathBuf;
 use std::process::ExitCode;
 
@@ -18,6 +20,18 @@ struct Cli {
 
 #[derive(Subcommand)]
 enum Command {
+    /// Run the appliance on a synthetic belt: no camera, no PLC needed.
+    Demo {
+        /// How long to run.
+        #[arg(long, default_value_t = 30.0)]
+        seconds: f64,
+        /// Folder for the table, the records and the annotated pictures.
+        #[arg(long, default_value = "demo-out")]
+        out: PathBuf,
+        /// Address and port of the Modbus server [default: 0.0.0.0:1502].
+        #[arg(long)]
+        listen: Option<SocketAddr>,
+    },
     /// Measure a recording, as fast as it goes.
     Measure {
         /// Y4M file, `-` for Y4M on standard input, or a directory of PNG, PGM or JPEG frames.
@@ -55,6 +69,11 @@ fn main() -> ExitCode {
 
 fn dispatch(command: Command) -> Result<()> {
     match command {
+        Command::Demo { seconds, out, listen } => {
+            let table = demo::run(demo::Options { seconds, out: &out, listen })?;
+            println!("{table}\npictures and records are in {}", out.display());
+            Ok(())
+        }
         Command::Measure { input, config, fps, jsonl, annotate } => {
             let site = Site::load(&config)?;
             let outputs = Outputs { jsonl: jsonl.as_deref(), annotate: annotate.as_deref() };
@@ -66,7 +85,7 @@ fn dispatch(command: Command) -> Result<()> {
         }
         Command::Check { config } => {
             let site = Site::load(&config)?;
-            println!("{}", pipeline::plan(&site));
+            println!("{}", run::plan(&site));
             Ok(())
         }
     }

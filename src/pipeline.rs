@@ -10,7 +10,7 @@ use crate::error::{Error, Result};
 use crate::event::{Counters, Flags, ParcelRecord, Shape};
 use crate::image::{FrameTime, Plane};
 use crate::kernel::scalar::bits::{dilate3x3, words};
-use crate::plan::{Block, Plan};
+use crate::plan::{Block, Memory, Plan};
 use crate::stage::background::Background;
 use crate::stage::measure::{self, Estimate, Frame, Measure};
 use crate::stage::odometry::Odometry;
@@ -62,55 +62,51 @@ pub struct Pipeline {
     at: BeltPosition,
     last: Option<FrameTime>,
     counters: Counters,
-    plan: Plan,
-}
-
-/// The memory plan of a site's pipeline.
-pub fn plan(site: &Site) -> Plan {
-    let mut plan = Plan::default();
-    let (size, limits) = (site.view.size_px, &site.config.limits);
-    Rectify::plan(&site.view, &mut plan);
-    Background::plan(size, &mut plan);
-    Odometry::plan(&site.view, &site.config.zone.rect(), &mut plan);
-    Segment::plan(size, limits, &mut plan);
-    Tracker::plan(limits.tracks_max, limits.blobs_max, &mut plan);
-    Measure::plan(limits.tracks_max, limits.views_per_track_max, &mut plan);
-    let mask = words(size[0]) * size[1];
-    plan.add::<u64>("pipeline.covered", mask, "bit: parcel or near one in the last frame");
-    plan.add::<u64>("pipeline.hold", mask, "bit: not to be learned as background");
-    plan.add::<u64>("pipeline.scratch", mask, "the other half of each dilation");
-    plan.add::<Reference>("pipeline.references", limits.tracks_max, "limits.tracks_max");
-    plan
 }
 
 impl Pipeline {
-    /// Plan, map and seal the memory, and compute the tables.
-    pub fn new(site: Site) -> Result<Self> {
-        let mut memory = plan(&site).reserve(site.config.limits.memory_mib_max)?;
+    /// Memory for a site.
+    pub fn plan(site: &Site, plan: &mut Plan) {
+        let (size, limits) = (site.view.size_px, &site.config.limits);
+        Rectify::plan(&site.view, plan);
+        Background::plan(size, plan);
+        Odometry::plan(&site.view, &site.config.zone.rect(), plan);
+        Segment::plan(size, limits, plan);
+        Tracker::plan(limits.tracks_max, limits.blobs_max, plan);
+        Measure::plan(limits.tracks_max, limits.views_per_track_max, plan);
+        let mask = words(size[0]) * size[1];
+        plan.add::<u64>("pipeline.covered", mask, "bit: parcel or near one in the last frame");
+        plan.add::<u64>("pipeline.hold", mask, "bit: not to be learned as background");
+        plan.add::<u64>("pipeline.scratch", mask, "the other half of each dilation");
+        plan.add::<Reference>("pipeline.references", limits.tracks_max, "limits.tracks_max");
+    }
+
+    /// Take the planned memory and compute the tables.
+    pub fn new(site: Site, memory: &mut Memory) -> Result<Self> {
         let (zone, view, config) = (site.config.zone.rect(), &site.view, &site.config);
         let magnification_max = view.magnification(site.height_max_mm);
         let start = FrameTime { index: 0, t_s: 0.0 };
         let nowhere =
             Reference { began_s: 0.0, time: start, at: BeltPosition::default(), fixed: false, clipped: false };
-        let rectify = Rectify::new(&site.camera, view, &mut memory)?;
+        let rectify = Rectify::new(&site.camera, view, memory)?;
         let background =
-            Background::new(view.size_px, config.background.clone(), &mut memory)?;
+            Background::new(view.size_px, config.background.clone(), memory)?;
         let odometry = Odometry::new(
             view,
             &zone,
             config.belt.speed_mm_per_s,
             config.odometry.speed_error_max,
-            &mut memory,
+            memory,
         )?;
         let segment =
-            Segment::new(view.size_px, view.mm_per_px, config.segment.clone(), &mut memory)?;
-        let tracker = Tracker::new(view.mm_per_px, magnification_max, &mut memory)?;
+            Segment::new(view.size_px, view.mm_per_px, config.segment.clone(), memory)?;
+        let tracker = Tracker::new(view.mm_per_px, magnification_max, memory)?;
         let measure = Measure::new(
             view.clone(),
             zone,
             site.height_max_mm,
             config.limits.views_per_track_max,
-            &mut memory,
+            memory,
         )?;
         Ok(Self {
             rectify,
@@ -126,7 +122,6 @@ impl Pipeline {
             at: BeltPosition::default(),
             last: None,
             counters: Counters::default(),
-            plan: memory.seal()?,
             zone,
             site,
         })
@@ -340,9 +335,14 @@ impl Pipeline {
         self.counters
     }
 
-    /// The memory in use.
-    pub fn plan(&self) -> &Plan {
-        &self.plan
+    /// Whether the empty belt has been learned.
+    pub fn ready(&self) -> bool {
+        self.background.learned()
+    }
+
+    /// The belt's motion in the last frame, and whether it was measured.
+    pub fn belt_motion(&self) -> (f64, bool) {
+        self.odometry.speed()
     }
 
     /// The site it was built for.

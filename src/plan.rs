@@ -78,6 +78,10 @@ impl Plan {
     }
 }
 
+fn not_planned(name: &str) -> Error {
+    Error::failure(format!("memory plan: {name} was not planned here"))
+}
+
 fn mib(bytes: usize) -> f64 {
     bytes as f64 / f64::from(1 << 20)
 }
@@ -113,31 +117,50 @@ pub struct Memory {
 impl Memory {
     /// Take the next planned buffer, filled with `value`. Filling touches every page now.
     pub fn take<T: Copy + Send + 'static>(&mut self, name: &'static str, value: T) -> Result<Block<T>> {
+        let mut parts = self.take_parts(name, 1, value)?;
+        parts.pop().ok_or_else(|| not_planned(name))
+    }
+
+    /// [`Memory::take`], as `parts` blocks of equal size with owners of their own.
+    pub fn take_parts<T: Copy + Send + 'static>(
+        &mut self,
+        name: &'static str,
+        parts: usize,
+        value: T,
+    ) -> Result<Vec<Block<T>>> {
         let planned = self.plan.entries.get(self.next).filter(|e| {
-            e.name == name && e.element_bytes == size_of::<T>() && align_of::<T>() <= ALIGN
+            e.name == name
+                && e.element_bytes == size_of::<T>()
+                && align_of::<T>() <= ALIGN
+                && e.count % parts == 0
         });
-        let Some(entry) = planned else {
-            return Err(Error::failure(format!("memory plan: {name} was not planned here")));
-        };
+        let Some(entry) = planned else { return Err(not_planned(name)) };
         let (count, bytes) = (entry.count, entry.bytes());
-        // SAFETY: plan order and next_multiple_of(ALIGN) give every block its own range, inside
+        // SAFETY: plan order and next_multiple_of(ALIGN) give every entry its own range, inside
         // the mapping, which holds the sum of them all; page-aligned base and 64-byte
         // offsets satisfy T's alignment (checked above). The Arc keeps the mapping alive.
         let start = unsafe { self.mapping.0.as_ptr().cast_mut().add(self.offset).cast::<T>() };
         for i in 0..count {
-            // SAFETY: i < count elements of T lie inside this block's range.
+            // SAFETY: i < count elements of T lie inside this entry's range.
             unsafe { start.add(i).write(value) };
         }
         self.next += 1;
         self.offset += bytes.next_multiple_of(ALIGN);
-        Ok(Block { start, count, _mapping: Arc::clone(&self.mapping) })
+        let part = count / parts;
+        let block = |i: usize| Block {
+            // SAFETY: parts * part = count, so every part lies inside the entry's range.
+            start: unsafe { start.add(i * part) },
+            count: part,
+            _mapping: Arc::clone(&self.mapping),
+        };
+        Ok((0..parts).map(block).collect())
     }
 
     /// No more buffers: everything planned must have been taken.
-    pub fn seal(self) -> Result<Plan> {
+    pub fn seal(self) -> Result<()> {
         match self.plan.entries.get(self.next) {
             Some(e) => Err(Error::failure(format!("memory plan: {} was never taken", e.name))),
-            None => Ok(self.plan),
+            None => Ok(()),
         }
     }
 }
@@ -189,6 +212,17 @@ mod tests {
         a.fill(1);
         assert_eq!((&a[..], &b[..]), (&[1u8; 3][..], &[7u64; 5][..]));
         assert_eq!(b.as_ptr() as usize % ALIGN, 0);
+    }
+
+    #[test]
+    fn parts_of_a_buffer_do_not_overlap() {
+        let mut memory = plan().reserve(1).expect("small");
+        let mut parts = memory.take_parts::<u8>("a", 3, 0).expect("planned");
+        for (i, part) in parts.iter_mut().enumerate() {
+            part[0] = i as u8 + 1;
+        }
+        assert_eq!(parts.iter().map(|p| p[0]).collect::<Vec<_>>(), [1, 2, 3]);
+        assert!(memory.take_parts::<u64>("b", 2, 0).is_err(), "5 elements in 2 parts");
     }
 
     #[test]

@@ -46,7 +46,7 @@ impl Annotator {
     ) -> Result<()> {
         for record in records {
             let frame = self.kept.get(&record.frame).map_or(raw, Vec::as_slice);
-            self.draw(frame, record, &pipeline.site().camera)?;
+            draw(frame, self.size_px, record, &pipeline.site().camera, &self.folder)?;
         }
         self.kept.retain(|&kept, _| pipeline.reference_frames().any(|(_, f)| f == kept));
         if pipeline.reference_frames().any(|(_, f)| f == index) {
@@ -54,9 +54,16 @@ impl Annotator {
         }
         Ok(())
     }
+}
 
-    fn draw(&self, raw: &[u8], record: &ParcelRecord, camera: &Camera) -> Result<()> {
-        let [width, height] = self.size_px;
+/// Draw a record over the frame where it holds, as `folder/parcel_NNNN.png`.
+pub fn draw(
+    raw: &[u8],
+    [width, height]: [usize; 2],
+    record: &ParcelRecord,
+    camera: &Camera,
+    folder: &Path,
+) -> Result<()> {
         let mut canvas = Canvas::new(raw, width, height);
         let (sin, cos) = record.yaw_deg.to_radians().sin_cos();
         let corner = |a: f64, b: f64, z: f64| {
@@ -89,11 +96,10 @@ impl Annotator {
         let right = seen().map(|p| p.x).max().unwrap_or(0) + 10;
         let above = seen().map(|p| p.y).min().unwrap_or(0);
         canvas.text(&text, Point::new(right.clamp(4, width as i32 - 190), above.clamp(18, height as i32 - 90)));
-        let path = self.folder.join(format!("parcel_{:04}.png", record.seq));
+        let path = folder.join(format!("parcel_{:04}.png", record.seq));
         image::save_buffer(&path, &canvas.rgb, width as u32, height as u32, image::ColorType::Rgb8)
             .map_err(|e| Error::failure(format!("cannot write the picture: {e}")).in_file(&path))
     }
-}
 
 /// An RGB picture to draw on.
 struct Canvas {

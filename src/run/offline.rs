@@ -1,11 +1,10 @@
 //! `beltgauge measure`: a replay through the pipeline, as fast as it goes.
 
-use super::Annotator;
+use super::{Annotator, memory};
 use crate::config::Site;
 use crate::error::{Error, Result};
 use crate::event::{Counters, ParcelRecord};
 use crate::image::Plane;
-use crate::pipeline::Pipeline;
 use crate::source::FrameSource;
 use std::io::{BufWriter, Write};
 use std::path::Path;
@@ -36,8 +35,8 @@ pub fn measure(
     }
     let mut annotator = outputs.annotate.map(|f| Annotator::new(f, [width, height])).transpose()?;
     let mut lines = outputs.jsonl.map(JsonLines::create).transpose()?;
-    let mut pipeline = Pipeline::new(site)?;
-    let mut frame = vec![0; width * height];
+    let (mut frames, mut pipeline) = memory::build(site)?;
+    let mut frame = frames.pop().ok_or_else(|| Error::failure("no frame was planned"))?;
     let mut records: Vec<ParcelRecord> = Vec::new();
     let mut last_index = 0;
     loop {

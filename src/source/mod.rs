@@ -21,6 +21,10 @@ pub trait FrameSource: Send {
 
     /// Fill `frame` (width x height bytes) with the next one; `None` at the end.
     fn next_into(&mut self, frame: &mut [u8]) -> Result<Option<FrameTime>>;
+
+    /// The next `count` frames were not taken in time: leave them out. A camera does so by
+    /// itself.
+    fn skip(&mut self, _count: u64) {}
 }
 
 /// Open a replay: a Y4M file, `-` for Y4M on standard input, or a directory of images.

@@ -163,6 +163,11 @@ impl Odometry {
         Motion { step_mm, measured: self.locked }
     }
 
+    /// Speed of the belt, mm/s, and whether it is measured rather than assumed.
+    pub fn speed(&self) -> (f64, bool) {
+        (self.speed_mm_per_s, self.locked)
+    }
+
     /// Whether the belt is known to stand still (below a tenth of the nominal speed).
     pub fn stands_still(&self) -> bool {
         self.locked && self.speed_mm_per_s.abs() < 0.1 * self.nominal_mm_per_s
@@ -219,7 +224,6 @@ impl Odometry {
             }
         }
         let (shift, rho, pairs) = best?;
-        if std::env::var_os("DBG").is_some() { eprintln!("  best {from} {to}: {shift} {rho:.3} {pairs}"); }
         // A maximum at the end of the range is a slope, not a match.
         if rho < MATCH_MIN || shift == from || shift == to {
             return None;

@@ -1,0 +1,305 @@
+//! The appliance: capture, vision and PLC threads, with rings between them.
+//!
+//! ```text
+//! source -> [ready ring] -> pipeline -> [records] -> Modbus registers
+//!    ^------ [free ring] <-----'           '-------> observer (console, pictures)
+//! ```
+//! A frame buffer is always in exactly one place. When no buffer is free the frame is dropped
+//! and counted; when a record ring is full the record is counted; vision never waits.
+
+use crate::config::Site;
+use crate::error::{Error, Result};
+use crate::event::ParcelRecord;
+use crate::image::{FrameTime, Plane};
+use crate::pipeline::Pipeline;
+use crate::plan::Block;
+use crate::plc::modbus;
+use crate::plc::registers::Status;
+use crate::source::FrameSource;
+use heapless::spsc::{Consumer, Producer, Queue};
+use std::sync::Mutex;
+use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
+use std::time::{Duration, Instant};
+
+/// Frame buffers that a ring holds: the largest `limits.frames_queued_max`, and one.
+const FRAME_RING: usize = 16;
+/// Records that wait for the PLC thread; at 2 ms a visit it is nearly always empty.
+const RECORD_RING: usize = 64;
+/// How long a thread sleeps when a ring is empty and nobody has woken it.
+const PARK: Duration = Duration::from_millis(50);
+/// Without a frame for this long the heartbeat stops.
+const SILENCE: Duration = Duration::from_secs(1);
+
+/// When frames are taken.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Pace {
+    /// The source blocks until a frame is due, as a camera does.
+    Source,
+    /// At the source's frame rate by the clock; a frame that is late is left out.
+    RealTime,
+}
+
+/// What an observer sees while the appliance runs.
+#[derive(Clone, Copy, Debug, Default)]
+pub struct Progress {
+    /// As the PLC sees it.
+    pub status: Status,
+    /// The slowest frame so far, in the pipeline alone.
+    pub frame_time_max: Duration,
+}
+
+/// A frame on its way.
+struct Frame {
+    pixels: Block<u8>,
+    time: FrameTime,
+}
+
+/// The appliance, before it runs.
+pub struct Appliance {
+    site: Site,
+    pace: Pace,
+    listener: std::net::TcpListener,
+}
+
+/// What the threads share.
+#[derive(Default)]
+struct Shared {
+    stop: AtomicBool,
+    source_ended: AtomicBool,
+    frames_dropped: AtomicU64,
+    progress: Mutex<Progress>,
+}
+
+impl Shared {
+    fn stopped(&self) -> bool {
+        self.stop.load(Ordering::Relaxed)
+    }
+
+    fn progress(&self) -> Progress {
+        let mut progress = *self.progress.lock().unwrap_or_else(std::sync::PoisonError::into_inner);
+        progress.status.source_ended = self.source_ended.load(Ordering::Relaxed);
+        progress.status.frames_dropped = self.frames_dropped.load(Ordering::Relaxed);
+        progress
+    }
+}
+
+impl Appliance {
+    /// Bind the PLC's socket; nothing runs yet.
+    pub fn new(site: Site, pace: Pace) -> Result<Self> {
+        let listener = modbus::bind(&site.config.modbus)?;
+        Ok(Self { site, pace, listener })
+    }
+
+    /// Run until the source ends or `observe` returns false. `observe` is called a few times a
+    /// second on the calling thread, with the records since its last call.
+    pub fn run(
+        self,
+        source: &mut dyn FrameSource,
+        mut observe: impl FnMut(&Progress, &mut dyn Iterator<Item = ParcelRecord>) -> bool,
+    ) -> Result<Progress> {
+        let modbus_settings = self.site.config.modbus.clone();
+        let (pace, listener) = (self.pace, self.listener);
+        let (buffers, pipeline) = super::memory::build(self.site)?;
+        let shared = Shared::default();
+        let (mut free, mut ready) = (Queue::<Block<u8>, FRAME_RING>::new(), Queue::<Frame, FRAME_RING>::new());
+        let (mut to_plc, mut to_observer) =
+            (Queue::<ParcelRecord, RECORD_RING>::new(), Queue::<ParcelRecord, RECORD_RING>::new());
+        let ((mut free_in, free_out), (ready_in, ready_out)) = (free.split(), ready.split());
+        let ((plc_in, mut plc_out), (observer_in, mut observer_out)) = (to_plc.split(), to_observer.split());
+        for buffer in buffers {
+            // limits.frames_queued_max is below FRAME_RING.
+            let _ = free_in.enqueue(buffer);
+        }
+        std::thread::scope(|scope| {
+            let shared = &shared;
+            let vision = Vision { pipeline, ready: ready_out, free: free_in, records: [plc_in, observer_in], shared };
+            let vision = spawn(scope, "vision", move || vision.run())?;
+            let waker = vision.thread().clone();
+            let capture = Capture { source, pace, free: free_out, ready: ready_in, shared, waker };
+            let capture = spawn(scope, "capture", move || capture.run())?;
+            let plc = spawn(scope, "plc", move || {
+                let mut heartbeat = Heartbeat::new();
+                modbus::serve(listener, &modbus_settings, |publish| {
+                    while let Some(record) = plc_out.dequeue() {
+                        publish(&record);
+                    }
+                    let mut status = shared.progress().status;
+                    heartbeat.update(&mut status);
+                    (!shared.stopped()).then_some(status)
+                })
+            })?;
+            while !capture.is_finished() && !plc.is_finished() {
+                std::thread::park_timeout(PARK);
+                let mut records = std::iter::from_fn(|| observer_out.dequeue());
+                if !observe(&shared.progress(), &mut records) {
+                    break;
+                }
+            }
+            shared.source_ended.store(true, Ordering::Relaxed);
+            let captured = join(capture, || shared.stop.store(true, Ordering::Relaxed));
+            let seen = join(vision, || {});
+            observe(&shared.progress(), &mut std::iter::from_fn(|| observer_out.dequeue()));
+            let served = join(plc, || {});
+            captured.and(seen).and(served).map(|()| shared.progress())
+        })
+    }
+}
+
+type Handle<'scope> = std::thread::ScopedJoinHandle<'scope, Result<()>>;
+
+fn spawn<'scope, 'env>(
+    scope: &'scope std::thread::Scope<'scope, 'env>,
+    name: &str,
+    body: impl FnOnce() -> Result<()> + Send + 'scope,
+) -> Result<Handle<'scope>> {
+    std::thread::Builder::new()
+        .name(name.to_owned())
+        .spawn_scoped(scope, body)
+        .map_err(|e| Error::failure(format!("cannot start the {name} thread: {e}")))
+}
+
+/// Wait for a thread after asking it to end; a panic in it is a broken invariant.
+fn join(handle: Handle<'_>, ask: impl FnOnce()) -> Result<()> {
+    ask();
+    handle.join().unwrap_or_else(|panic| std::panic::resume_unwind(panic))
+}
+
+/// The capture thread.
+struct Capture<'a> {
+    source: &'a mut dyn FrameSource,
+    pace: Pace,
+    free: Consumer<'a, Block<u8>>,
+    ready: Producer<'a, Frame>,
+    shared: &'a Shared,
+    waker: std::thread::Thread,
+}
+
+impl Capture<'_> {
+    fn run(mut self) -> Result<()> {
+        let result = self.frames();
+        self.shared.source_ended.store(true, Ordering::Relaxed);
+        self.waker.unpark();
+        result
+    }
+
+    fn frames(&mut self) -> Result<()> {
+        let start = Instant::now();
+        let period_s = 1.0 / self.source.fps();
+        let mut taken = 0u64;
+        while !self.shared.stopped() {
+            if self.pace == Pace::RealTime {
+                taken += self.wait_until_due(start, taken, period_s);
+            }
+            let Some(mut pixels) = self.free.dequeue() else {
+                self.drop_frames(1);
+                taken += 1;
+                if self.pace == Pace::Source {
+                    std::thread::sleep(Duration::from_secs_f64(period_s));
+                }
+                continue;
+            };
+            let Some(time) = self.source.next_into(&mut pixels)? else { return Ok(()) };
+            taken += 1;
+            // There are no more frames than places in the ring.
+            let _ = self.ready.enqueue(Frame { pixels, time });
+            self.waker.unpark();
+        }
+        Ok(())
+    }
+
+    /// Sleep until frame `taken` is due; frames that are over already are dropped and counted.
+    fn wait_until_due(&mut self, start: Instant, taken: u64, period_s: f64) -> u64 {
+        let due = start + Duration::from_secs_f64(taken as f64 * period_s);
+        let now = Instant::now();
+        if due > now {
+            std::thread::sleep(due - now);
+            return 0;
+        }
+        let late = ((now - due).as_secs_f64() / period_s) as u64;
+        self.drop_frames(late);
+        late
+    }
+
+    fn drop_frames(&mut self, count: u64) {
+        if count > 0 {
+            self.source.skip(count);
+            self.shared.frames_dropped.fetch_add(count, Ordering::Relaxed);
+        }
+    }
+}
+
+/// The vision thread.
+struct Vision<'a> {
+    pipeline: Pipeline,
+    ready: Consumer<'a, Frame>,
+    free: Producer<'a, Block<u8>>,
+    records: [Producer<'a, ParcelRecord>; 2],
+    shared: &'a Shared,
+}
+
+impl Vision<'_> {
+    fn run(mut self) -> Result<()> {
+        let [width, height] = self.pipeline.site().camera.image_size_px;
+        let mut overflows = 0;
+        loop {
+            let Some(frame) = self.ready.dequeue() else {
+                if self.shared.source_ended.load(Ordering::Relaxed) && self.ready.is_empty() {
+                    return Ok(());
+                }
+                std::thread::park_timeout(PARK);
+                continue;
+            };
+            let began = Instant::now();
+            let raw = Plane::packed(&frame.pixels, width, height)
+                .ok_or_else(|| Error::failure("a frame of another size"))?;
+            let records = &mut self.records;
+            self.pipeline.step(raw, frame.time, &mut |record| {
+                for ring in records.iter_mut() {
+                    overflows += u64::from(ring.enqueue(record).is_err());
+                }
+            })?;
+            self.publish(began.elapsed(), overflows);
+            let _ = self.free.enqueue(frame.pixels);
+        }
+    }
+
+    fn publish(&self, frame_time: Duration, overflows: u64) {
+        let (speed, measured) = self.pipeline.belt_motion();
+        let mut progress = self.shared.progress.lock().unwrap_or_else(std::sync::PoisonError::into_inner);
+        let status = &mut progress.status;
+        status.counters = self.pipeline.counters();
+        status.counters.event_overflows = overflows;
+        status.ready = self.pipeline.ready();
+        status.belt_speed_mm_per_s = speed.max(0.0);
+        status.belt_measured = measured;
+        progress.frame_time_max = progress.frame_time_max.max(frame_time);
+    }
+}
+
+/// Rises ten times a second while frames arrive.
+struct Heartbeat {
+    start: Instant,
+    frames: u64,
+    last_frame: Instant,
+    beat: u16,
+}
+
+impl Heartbeat {
+    fn new() -> Self {
+        let now = Instant::now();
+        Self { start: now, frames: 0, last_frame: now, beat: 0 }
+    }
+
+    fn update(&mut self, status: &mut Status) {
+        let now = Instant::now();
+        if status.counters.frames != self.frames {
+            self.frames = status.counters.frames;
+            self.last_frame = now;
+        }
+        status.running = self.frames > 0 && now - self.last_frame < SILENCE && !status.source_ended;
+        if status.running {
+            self.beat = ((now - self.start).as_millis() / 100) as u16;
+        }
+        status.heartbeat = self.beat;
+    }
+}

@@ -1,0 +1,164 @@
+//! `beltgauge demo`: the appliance in real time on the synthetic belt, and the truth beside it.
+
+use super::annotate::draw;
+use super::{Appliance, Pace, Progress};
+use crate::config::{Config, Site};
+use crate::error::{Error, Result};
+use crate::event::ParcelRecord;
+use crate::source::FrameSource;
+use crate::source::synthetic::{Parcel, Scenario, Synthetic};
+use std::fmt::Write as _;
+use std::io::Write as _;
+use std::net::SocketAddr;
+use std::path::Path;
+use std::time::{Duration, Instant};
+
+const SCENARIO: &str = include_str!("../../config/demo/scenario.toml");
+const CONFIG: &str = include_str!("../../config/demo/beltgauge.toml");
+/// A record belongs to the parcel whose true centre is this near.
+const MATCH_MM: f64 = 60.0;
+/// The console line is renewed this often.
+const CONSOLE_PERIOD: Duration = Duration::from_millis(200);
+
+/// What to run.
+#[derive(Clone, Copy, Debug)]
+pub struct Options<'a> {
+    /// How long.
+    pub seconds: f64,
+    /// Folder for table, records and pictures; created.
+    pub out: &'a Path,
+    /// Where the Modbus server listens; default: the demo configuration's port 1502.
+    pub listen: Option<SocketAddr>,
+}
+
+/// The demo's scenario.
+pub fn scenario() -> Result<Scenario> {
+    Scenario::parse(SCENARIO)
+}
+
+/// The demo's site: its configuration with the scenario's camera.
+pub fn site(scenario: &Scenario) -> Result<Site> {
+    Site::new(Config::parse(CONFIG)?, scenario.camera()?)
+}
+
+/// Run the demo; returns the table of measured against true sizes.
+pub fn run(options: Options<'_>) -> Result<String> {
+    if !(1.0..=3000.0).contains(&options.seconds) {
+        return Err(Error::configuration(format!("--seconds {}", options.seconds)).allowed("1 to 3000"));
+    }
+    let scenario = scenario()?;
+    let mut site = site(&scenario)?;
+    if let Some(listen) = options.listen {
+        site.config.modbus.listen = listen;
+    }
+    let listen = site.config.modbus.listen;
+    let camera = site.camera.clone();
+    let failed = |e: std::io::Error| {
+        Error::failure(format!("cannot write the results: {e}")).in_file(options.out)
+    };
+    std::fs::create_dir_all(options.out).map_err(failed)?;
+    eprintln!("rendering the belt; Modbus TCP on {listen}, registers as in config/REGISTERS.md");
+    let mut source = Synthetic::new(scenario)?;
+    let appliance = Appliance::new(site, Pace::RealTime)?;
+    let mut records: Vec<ParcelRecord> = Vec::new();
+    let (start, mut shown) = (Instant::now(), Instant::now());
+    let progress = appliance.run(&mut source, |progress, new| {
+        records.extend(new);
+        if shown.elapsed() >= CONSOLE_PERIOD {
+            shown = Instant::now();
+            console(progress, start.elapsed(), records.last());
+        }
+        start.elapsed().as_secs_f64() < options.seconds
+    })?;
+    eprintln!();
+    let mut lines = Vec::new();
+    for record in &records {
+        serde_json::to_writer(&mut lines, record).map_err(|e| failed(e.into()))?;
+        lines.push(b'\n');
+    }
+    std::fs::write(options.out.join("parcels.jsonl"), lines).map_err(failed)?;
+    let [width, height] = source.size_px();
+    let mut frame = vec![0; width * height];
+    for record in &records {
+        // The belt is deterministic: the frame where a record holds is rendered once more.
+        source.render(record.frame, &mut frame);
+        draw(&frame, [width, height], record, &camera, options.out)?;
+    }
+    let table = table(source.scenario(), &records, &progress);
+    std::fs::write(options.out.join("table.txt"), &table).map_err(failed)?;
+    Ok(table)
+}
+
+fn console(progress: &Progress, elapsed: Duration, last: Option<&ParcelRecord>) {
+    let status = &progress.status;
+    let latest = last.map_or_else(String::new, |r| {
+        format!("  latest #{} {:.1} x {:.1} x {:.1} mm", r.seq, r.length_mm, r.width_mm, r.height_mm)
+    });
+    let line = format!(
+        "{:5.1} s  frame {}  dropped {}  belt {:.1} mm/s{}  parcels {}{latest}",
+        elapsed.as_secs_f64(),
+        status.counters.frames,
+        status.frames_dropped,
+        status.belt_speed_mm_per_s,
+        if status.belt_measured { "" } else { " (assumed)" },
+        status.counters.parcels,
+    );
+    eprint!("\r{line:100}");
+    let _ = std::io::stderr().flush();
+}
+
+/// The parcel of the scenario that a record is of.
+fn truth(scenario: &Scenario, record: &ParcelRecord) -> Option<Parcel> {
+    let travel_mm = scenario.travel_at_frame_mm(record.frame);
+    let distance = |p: &Parcel| (p.x_mm + travel_mm - record.x_mm).hypot(p.y_mm - record.y_mm);
+    let nearest = scenario.parcels().iter().min_by(|a, b| distance(a).total_cmp(&distance(b)))?;
+    (distance(nearest) < MATCH_MM).then_some(*nearest)
+}
+
+fn table(scenario: &Scenario, records: &[ParcelRecord], progress: &Progress) -> String {
+    let mut text = String::from(
+        "  #      true L x W x H mm     measured L x W x H mm           error mm        2 sigma mm  flags\n",
+    );
+    let (mut sum, mut count, mut worst) = (0.0, 0u32, 0.0f64);
+    for r in records {
+        let measured = [r.length_mm, r.width_mm, r.height_mm];
+        let sigma = [r.sigma_length_mm, r.sigma_width_mm, r.sigma_height_mm];
+        let triple = |v: [f64; 3]| format!("{:6.1} {:6.1} {:6.1}", v[0], v[1], v[2]);
+        let flags = serde_json::to_string(&r.flags).unwrap_or_default();
+        let Some(parcel) = truth(scenario, r) else {
+            let _ = writeln!(text, "{:3}  {:>22}    {}   belongs to no parcel  {flags}", r.seq, "-", triple(measured));
+            continue;
+        };
+        let true_size = [parcel.length_mm, parcel.width_mm, parcel.height_mm];
+        let error = [0, 1, 2].map(|i| measured[i] - true_size[i]);
+        for e in error.map(f64::abs) {
+            sum += e;
+            count += 1;
+            worst = worst.max(e);
+        }
+        let _ = writeln!(
+            text,
+            "{:3}   {}      {}    {:+6.2} {:+6.2} {:+6.2}   {:4.1} {:4.1} {:4.1}  {flags}",
+            r.seq,
+            triple(true_size),
+            triple(measured),
+            error[0],
+            error[1],
+            error[2],
+            2.0 * sigma[0],
+            2.0 * sigma[1],
+            2.0 * sigma[2],
+        );
+    }
+    let _ = writeln!(
+        text,
+        "{} parcels, mean absolute error {:.2} mm, largest {worst:.2} mm; {} frames, {} dropped, \
+         slowest {:.1} ms",
+        records.len(),
+        sum / f64::from(count.max(1)),
+        progress.status.counters.frames,
+        progress.status.frames_dropped,
+        progress.frame_time_max.as_secs_f64() * 1e3,
+    );
+    text
+}
