@@ -79,7 +79,7 @@ pub struct Masks {
 
 /// Classify and learn 64 pixels or fewer; bit i of the result is pixel i.
 ///
-/// Pixels whose bit in `hold` is set are classified but not learned. All slices have the
+/// Shadows, and pixels whose bit in `hold` is set, are classified but not learned. All slices have the
 /// same length, at most 64.
 pub fn update(grey: &[u8], modes: &mut [ModeRow<'_>; MODES], hold: u64, params: &Params) -> Masks {
     let mut masks = Masks::default();
@@ -93,7 +93,8 @@ pub fn update(grey: &[u8], modes: &mut [ModeRow<'_>; MODES], hold: u64, params: 
             let strong = !within(x, modes[0].mean[i], modes[0].variance[i], far);
             masks.strong |= u64::from(strong) << i;
         }
-        if hold >> i & 1 == 0 {
+        // A shadow comes and goes with its parcel: learned, it would hide the next dark one.
+        if hold >> i & 1 == 0 && class != Class::Shadow {
             learn(x, modes, i, params);
         }
     }
@@ -244,6 +245,15 @@ mod tests {
         let mut model = Model::learned(100);
         assert!(!model.step(80, 1, 131));
         assert!(model.step(60, 1, 131));
+    }
+
+    #[test]
+    fn a_lasting_shadow_never_becomes_background() {
+        let mut model = Model::learned(100);
+        for _ in 0..2000 {
+            model.step(80, 0, 131);
+        }
+        assert_eq!(model.0[1][0], 0, "no second mode");
     }
 
     #[test]

@@ -82,6 +82,14 @@ pub struct Estimate {
     pub reach_error: f64,
 }
 
+/// What the profiles say about a face.
+struct FaceVote {
+    /// Outward from the silhouette's face to the edge agreed upon, mm.
+    offset_mm: f64,
+    /// How far its base edge appears outside its top edge, where that could be mistaken.
+    side_depth_mm: Option<f64>,
+}
+
 /// Sums of a least squares problem.
 struct Normal {
     matrix: SMatrix<f64, N, N>,
@@ -141,9 +149,33 @@ impl Problem<'_> {
         self.estimate(params, &normal, reach_error, &EdgeUse::default())
     }
 
-    /// Fit edges, starting from an estimate.
+    /// Fit edges, starting from an estimate of the silhouettes. On a side that faces the camera
+    /// the strongest edge may be the top one or the one on the belt: both are tried, and the
+    /// cuboid that explains more contrast is kept.
     pub fn fit_edges(&self, views: &[View], start: Params) -> Option<Estimate> {
-        let mut params = self.align(views, start);
+        let found = self.face_votes(views, &start);
+        let mut best: Option<Estimate> = None;
+        for as_base in 0..16u8 {
+            let takes = |k: usize| as_base >> k & 1 == 1;
+            if (0..4).any(|k| takes(k) && found[k].side_depth_mm.is_none()) {
+                continue;
+            }
+            let offsets = std::array::from_fn(|k| {
+                let depth = if takes(k) { found[k].side_depth_mm } else { None };
+                found[k].offset_mm - depth.unwrap_or(0.0)
+            });
+            let fitted = self.refine_edges(views, self.moved(start, offsets));
+            let contrast = |e: &Option<Estimate>| e.map_or(f64::NEG_INFINITY, |e| e.edge_contrast);
+            if contrast(&fitted) > contrast(&best) {
+                best = fitted;
+            }
+        }
+        best
+    }
+
+    /// Gauss-Newton on the edges, the gate closing.
+    fn refine_edges(&self, views: &[View], start: Params) -> Option<Estimate> {
+        let mut params = start;
         let mut polarity = [0.0; EDGES];
         let mut last = None;
         for gate_px in GATES_PX {
@@ -159,11 +191,20 @@ impl Problem<'_> {
         self.estimate(params, &normal, reach_error, &used)
     }
 
-    /// Move the four faces to where most profiles of the whole pass agree on a top edge.
-    fn align(&self, views: &[View], params: Params) -> Params {
+    /// Where most profiles of the whole pass agree on an edge at each face.
+    fn face_votes(&self, views: &[View], params: &Params) -> [FaceVote; 4] {
         let mut votes = [[0.0f64; VOTE_BINS]; 4];
+        let mut depth = [(0.0, 0u32); 4];
+        let mut sampled = 0;
         for view in views.iter().filter(|v| !v.samples().is_empty()) {
-            let outline = Outline::new(self.geometry, &params, view.travel_mm - self.reference_travel_mm);
+            let outline = Outline::new(self.geometry, params, view.travel_mm - self.reference_travel_mm);
+            sampled += 1;
+            for (k, (sum, count)) in depth.iter_mut().enumerate() {
+                if outline.side_visible[k] {
+                    *sum += outline.side_depth_mm(k);
+                    *count += 1;
+                }
+            }
             for sample in view.samples().iter().filter(|s| !s.edge.is_base()) {
                 let Some((at, _)) = self.predict(&outline, sample) else { continue };
                 for step in sample.steps.iter().filter(|s| s.slope != 0.0) {
@@ -177,16 +218,28 @@ impl Problem<'_> {
             }
         }
         let m = self.geometry.magnification(params[HEIGHT]);
-        let [front, left, back, right] =
-            votes.map(|v| outermost_peak(&v).map_or(0.0, |px| px * self.geometry.mm_per_px / m));
+        std::array::from_fn(|k| {
+            let (sum, count) = depth[k];
+            let mean = sum / f64::from(count.max(1));
+            // A side seen in passing shows its base edge smeared: no peak to mistake.
+            let confusing = 2 * count > sampled && mean > SIDE_DEPTH_MIN_PX * self.geometry.mm_per_px;
+            FaceVote {
+                offset_mm: outermost_peak(&votes[k]).map_or(0.0, |px| px * self.geometry.mm_per_px / m),
+                side_depth_mm: confusing.then_some(mean / m),
+            }
+        })
+    }
+
+    /// The cuboid with its four faces moved outward.
+    fn moved(&self, params: Params, [front, left, back, right]: [f64; 4]) -> Params {
         let (sin, cos) = params[YAW].sin_cos();
         let (along, across) = (0.5 * (front - back), 0.5 * (left - right));
-        let mut aligned = params;
-        aligned[LENGTH] += front + back;
-        aligned[WIDTH] += left + right;
-        aligned[X] += cos * along - sin * across;
-        aligned[Y] += sin * along + cos * across;
-        self.bounded(params, aligned)
+        let mut moved = params;
+        moved[LENGTH] += front + back;
+        moved[WIDTH] += left + right;
+        moved[X] += cos * along - sin * across;
+        moved[Y] += sin * along + cos * across;
+        self.bounded(params, moved)
     }
 
     fn estimate(
