@@ -90,11 +90,8 @@ impl Error {
 impl fmt::Display for Error {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         write!(f, "{}", self.0.what)?;
-        let lines = [
-            ("where", &self.0.place),
-            ("allowed", &self.0.allowed),
-            ("remedy", &self.0.remedy),
-        ];
+        let lines =
+            [("where", &self.0.place), ("allowed", &self.0.allowed), ("remedy", &self.0.remedy)];
         for (label, text) in lines.into_iter().filter(|(_, text)| !text.is_empty()) {
             write!(f, "\n  {label:8}{text}")?;
         }

@@ -69,7 +69,8 @@ impl<'a> Plane<'a> {
         let (fx, fy) = (x - column as f32, y - row as f32);
         let top = &self.row(row)[column..column + 2];
         let bottom = &self.row(row + 1)[column..column + 2];
-        let lerp = |pair: &[u8]| f32::from(pair[0]) + fx * (f32::from(pair[1]) - f32::from(pair[0]));
+        let lerp =
+            |pair: &[u8]| f32::from(pair[0]) + fx * (f32::from(pair[1]) - f32::from(pair[0]));
         let (t, b) = (lerp(top), lerp(bottom));
         Some(t + fy * (b - t))
     }

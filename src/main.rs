@@ -2,8 +2,8 @@
 
 use beltgauge::config::Site;
 use beltgauge::error::Result;
-use beltgauge::run::offline::{self, Outputs};
 use beltgauge::run::demo;
+use beltgauge::run::offline::{self, Outputs};
 use beltgauge::{run, source};
 use clap::{Parser, Subcommand};
 use std::net::SocketAddr;

@@ -15,9 +15,10 @@ use crate::stage::background::Background;
 use crate::stage::measure::{self, Estimate, Frame, Measure};
 use crate::stage::odometry::Odometry;
 use crate::stage::rectify::Rectify;
-use crate::stage::segment::Segment;
+use crate::stage::segment::{Blob, Segment};
 use crate::stage::track::{Change, NOBODY, Phase, Track, Tracker};
-use crate::units::BeltRect;
+use crate::units::{BeltPx, BeltRect};
+use nalgebra::Vector2;
 
 /// Below this share of profiles with an edge where the cuboid has one, it is no cuboid.
 const BOX_EDGE_SHARE_MIN: f64 = 0.5;
@@ -30,6 +31,9 @@ const HOLD_MARGIN_PX: usize = 2;
 /// Around a parcel this many px are no witness of the belt's motion: blur and compression
 /// carry the parcel's own, faster motion into them.
 const COVER_MARGIN_PX: usize = 8;
+
+/// A blob whose middle is this near to a parcel's silhouette is a piece of that parcel.
+const PIECE_MARGIN_PX: f64 = 8.0;
 
 /// When and where a track passed the middle of the zone.
 #[derive(Clone, Copy)]
@@ -86,11 +90,15 @@ impl Pipeline {
         let (zone, view, config) = (site.config.zone.rect(), &site.view, &site.config);
         let magnification_max = view.magnification(site.height_max_mm);
         let start = FrameTime { index: 0, t_s: 0.0 };
-        let nowhere =
-            Reference { began_s: 0.0, time: start, at: BeltPosition::default(), fixed: false, clipped: false };
+        let nowhere = Reference {
+            began_s: 0.0,
+            time: start,
+            at: BeltPosition::default(),
+            fixed: false,
+            clipped: false,
+        };
         let rectify = Rectify::new(&site.camera, view, memory)?;
-        let background =
-            Background::new(view.size_px, config.background.clone(), memory)?;
+        let background = Background::new(view.size_px, config.background.clone(), memory)?;
         let odometry = Odometry::new(
             view,
             &zone,
@@ -98,8 +106,7 @@ impl Pipeline {
             config.odometry.speed_error_max,
             memory,
         )?;
-        let segment =
-            Segment::new(view.size_px, view.mm_per_px, config.segment.clone(), memory)?;
+        let segment = Segment::new(view.size_px, view.mm_per_px, config.segment.clone(), memory)?;
         let tracker = Tracker::new(view.mm_per_px, magnification_max, memory)?;
         let measure = Measure::new(
             view.clone(),
@@ -147,14 +154,10 @@ impl Pipeline {
         }
         self.segment.step(self.background.foreground(), self.background.strong());
         self.cover();
-        let motion =
-            self.odometry.step(self.rectify.view(), &self.background, &self.covered, dt_s);
+        let motion = self.odometry.step(self.rectify.view(), &self.background, &self.covered, dt_s);
         self.at.advance(motion.step_mm, motion.measured);
-        if std::env::var_os("DBG").is_some() { eprintln!("ODO {} {:.3} {} {:.3} gain {:.4}", time.index, motion.step_mm, motion.measured, self.at.travel_mm, self.background.gain()); }
-        self.tracker.step(self.segment.blobs(), motion.step_mm, self.at);
+        self.track(motion.step_mm);
         self.measure_tracks(time);
-        #[cfg(debug_dump)]
-        self.dump(time.index);
         self.report(emit);
         self.counters.segment_overflows = self.segment.overflows;
         self.counters.track_overflows = self.tracker.overflows;
@@ -212,12 +215,33 @@ impl Pipeline {
         }
     }
 
+    /// Give blobs to tracks. A piece beside a measured cuboid (a side face as grey as the belt
+    /// cuts the shadow beyond it off) is part of that parcel.
+    fn track(&mut self, step_mm: f64) {
+        let Self { tracker, segment, measure, site, at, .. } = self;
+        let belongs = |slot: usize, blob: &Blob| {
+            let b = blob.bounds;
+            let centre =
+                BeltPx { u: f64::from(b.u0 + b.u1) / 2.0, v: f64::from(b.v0 + b.v1) / 2.0 };
+            let centre = site.view.belt_point(centre);
+            let margin_mm = PIECE_MARGIN_PX * site.view.mm_per_px;
+            let outline = measure.outline(slot, *at);
+            outline.is_some_and(|o| o.covers(Vector2::new(centre.x, centre.y), margin_mm))
+        };
+        tracker.step(segment.blobs(), step_mm, *at, &belongs);
+    }
+
     fn measure_tracks(&mut self, time: FrameTime) {
         for &(slot, change) in self.tracker.changes() {
             if change == Change::Began {
                 self.measure.begin(slot, self.at);
-                self.references[slot] =
-                    Reference { began_s: time.t_s, time, at: self.at, fixed: false, clipped: false };
+                self.references[slot] = Reference {
+                    began_s: time.t_s,
+                    time,
+                    at: self.at,
+                    fixed: false,
+                    clipped: false,
+                };
             }
         }
         let frame = Frame {
@@ -243,7 +267,8 @@ impl Pipeline {
                 let x_mm = outline.map_or(f64::NEG_INFINITY, |o| {
                     0.25 * o.base.iter().map(|v| v.over_belt.x).sum::<f64>()
                 });
-                *reference = Reference { time, at: self.at, fixed: x_mm >= middle_mm, ..*reference };
+                *reference =
+                    Reference { time, at: self.at, fixed: x_mm >= middle_mm, ..*reference };
             }
         }
     }
@@ -265,7 +290,7 @@ impl Pipeline {
             let trailing_mm = match self.measure.outline(slot, self.at) {
                 Some(outline) => outline.trailing_x_mm(),
                 None => {
-                    let px = crate::units::BeltPx { u: f64::from(track.bounds.u0), v: 0.0 };
+                    let px = BeltPx { u: f64::from(track.bounds.u0), v: 0.0 };
                     self.site.view.belt_point(px).x
                 }
             };
@@ -279,8 +304,8 @@ impl Pipeline {
     fn emit(&mut self, slot: usize, flags: Flags, emit: &mut dyn FnMut(ParcelRecord)) {
         let reference = self.references[slot];
         let estimate = self.measure.finish(slot, reference.at);
-        // An unfinished pass counts only if it could be measured.
-        let estimate = estimate.filter(|e| e.edge_count > 0 || !flags.has(Flags::UNFINISHED));
+        // A pass that was cut short counts only if it could be measured.
+        let estimate = estimate.filter(|e| e.edge_count > 0 || flags == Flags::default());
         let Some(estimate) = estimate else {
             self.counters.unmeasured += 1;
             return;
@@ -290,13 +315,20 @@ impl Pipeline {
         emit(record);
     }
 
-    fn record(&self, slot: usize, fit: &Estimate, reference: Reference, flags: Flags) -> ParcelRecord {
+    fn record(
+        &self,
+        slot: usize,
+        fit: &Estimate,
+        reference: Reference,
+        flags: Flags,
+    ) -> ParcelRecord {
         let track = &self.tracker.tracks()[slot];
         let (p, s) = (&fit.params, &fit.sigma);
         let travel_sigma = self.at.sigma_since(&track.first);
         let elapsed_s = self.last.map_or(0.0, |last| last.t_s - reference.began_s);
         let travel_mm = self.at.travel_mm - track.first.travel_mm;
-        let shape = if fit.edge_share >= BOX_EDGE_SHARE_MIN { Shape::Box } else { Shape::Irregular };
+        let shape =
+            if fit.edge_share >= BOX_EDGE_SHARE_MIN { Shape::Box } else { Shape::Irregular };
         let mut record = ParcelRecord {
             seq: self.counters.parcels as u32,
             frame: reference.time.index,
@@ -363,29 +395,5 @@ fn widen(mask: &mut Block<u64>, scratch: &mut Block<u64>, width: usize, times: u
 fn set_bits(row: &mut [u64], start: u16, end: u16) {
     for u in usize::from(start)..usize::from(end) {
         row[u / 64] |= 1 << (u % 64);
-    }
-}
-#[cfg(debug_dump)]
-impl Pipeline {
-    pub fn dump(&self, index: u64) {
-        let dir = std::env::var("DBGDIR").unwrap();
-        let [w, h] = self.site.view.size_px;
-        let mut rgb = Vec::with_capacity(w * h * 3);
-        let n = words(w);
-        for v in 0..h { for u in 0..w {
-            let g = self.rectify.view().at(u, v);
-            let m = self.segment.mask()[v * n + u / 64] >> (u % 64) & 1 == 1;
-            let f = self.background.foreground()[v * n + u / 64] >> (u % 64) & 1 == 1;
-            rgb.extend([if m { g / 2 + 127 } else { g }, if f { g / 2 + 127 } else { g }, g]);
-        }}
-        for (k, t) in self.tracker.tracks().iter().enumerate() {
-            if t.phase == Phase::Free { continue; }
-            let c = match t.phase { Phase::Candidate => [255, 255, 0], Phase::Riding => [0, 255, 0], _ => [0, 0, 255] };
-            let _ = k;
-            let b = t.bounds;
-            for u in b.u0.max(0.0) as usize..=(b.u1.max(0.0) as usize).min(w - 1) { for v in [b.v0 as usize, (b.v1 as usize).min(h - 1)] { rgb[3 * (v * w + u)..][..3].copy_from_slice(&c); } }
-            for v in b.v0.max(0.0) as usize..=(b.v1 as usize).min(h - 1) { for u in [(b.u0.max(0.0) as usize).min(w - 1), (b.u1.max(0.0) as usize).min(w - 1)] { rgb[3 * (v * w + u)..][..3].copy_from_slice(&c); } }
-        }
-        image::save_buffer(format!("{dir}/d{index:04}.png"), &rgb, w as u32, h as u32, image::ColorType::Rgb8).unwrap();
     }
 }

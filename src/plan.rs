@@ -100,7 +100,15 @@ impl fmt::Display for Plan {
                 e.reason
             )?;
         }
-        write!(f, "{:24} {:>10} {:>6} {:>12}  {:.1} MiB", "total", "", "", self.bytes(), mib(self.bytes()))
+        write!(
+            f,
+            "{:24} {:>10} {:>6} {:>12}  {:.1} MiB",
+            "total",
+            "",
+            "",
+            self.bytes(),
+            mib(self.bytes())
+        )
     }
 }
 
@@ -116,7 +124,11 @@ pub struct Memory {
 
 impl Memory {
     /// Take the next planned buffer, filled with `value`. Filling touches every page now.
-    pub fn take<T: Copy + Send + 'static>(&mut self, name: &'static str, value: T) -> Result<Block<T>> {
+    pub fn take<T: Copy + Send + 'static>(
+        &mut self,
+        name: &'static str,
+        value: T,
+    ) -> Result<Block<T>> {
         let mut parts = self.take_parts(name, 1, value)?;
         parts.pop().ok_or_else(|| not_planned(name))
     }

@@ -36,10 +36,14 @@ pub struct Lens {
 
 impl Lens {
     /// A lens; `reach` is found by walking outward until the model folds back.
-    pub fn new(model: LensModel, focal_px: [f64; 2], centre_px: [f64; 2], distortion: [f64; 5]) -> Self {
+    pub fn new(
+        model: LensModel,
+        focal_px: [f64; 2],
+        centre_px: [f64; 2],
+        distortion: [f64; 5],
+    ) -> Self {
         let [[fx_px, fy_px], [cx_px, cy_px]] = [focal_px, centre_px];
-        let mut lens =
-            Self { model, fx_px, fy_px, cx_px, cy_px, distortion, reach: f64::INFINITY };
+        let mut lens = Self { model, fx_px, fy_px, cx_px, cy_px, distortion, reach: f64::INFINITY };
         // A 179 degree lens has tan = 115; 8 is 166 degrees, beyond any brown lens.
         let end = match model {
             LensModel::Brown => 8.0,
@@ -59,7 +63,9 @@ impl Lens {
         let r2 = r * r;
         match self.model {
             LensModel::Brown => 1.0 + r2 * (3.0 * k1 + r2 * (5.0 * k2 + r2 * 7.0 * k3)),
-            LensModel::Fisheye => 1.0 + r2 * (3.0 * k1 + r2 * (5.0 * k2 + r2 * (7.0 * a + r2 * 9.0 * b))),
+            LensModel::Fisheye => {
+                1.0 + r2 * (3.0 * k1 + r2 * (5.0 * k2 + r2 * (7.0 * a + r2 * 9.0 * b)))
+            }
         }
     }
 
@@ -94,7 +100,8 @@ impl Lens {
 
     /// Direction (not normalised) in the camera frame of a raw pixel's ray.
     pub fn unproject(&self, px: RawPx) -> Option<Vector3<f64>> {
-        let target = Vector2::new((px.x - self.cx_px) / self.fx_px, (px.y - self.cy_px) / self.fy_px);
+        let target =
+            Vector2::new((px.x - self.cx_px) / self.fx_px, (px.y - self.cy_px) / self.fy_px);
         match self.model {
             LensModel::Brown => {
                 let p = self.undistort_brown(target)?;
@@ -199,7 +206,10 @@ mod tests {
                     let ray = lens.unproject(px).expect("inside the model");
                     let back = lens.project(ray).expect("inside the model");
                     // Newton stops at 1e-12 of the focal length, 1e-9 px.
-                    assert!((back.x - px.x).hypot(back.y - px.y) < 1e-8, "{lens:?} {px:?} {back:?}");
+                    assert!(
+                        (back.x - px.x).hypot(back.y - px.y) < 1e-8,
+                        "{lens:?} {px:?} {back:?}"
+                    );
                 }
             }
         }
@@ -230,7 +240,8 @@ mod tests {
 
     #[test]
     fn a_ray_beyond_the_fold_has_no_image() {
-        let lens = Lens::new(LensModel::Brown, [500.0; 2], [320.0, 240.0], [-0.3, 0.0, 0.0, 0.0, 0.0]);
+        let lens =
+            Lens::new(LensModel::Brown, [500.0; 2], [320.0, 240.0], [-0.3, 0.0, 0.0, 0.0, 0.0]);
         // r (1 - 0.3 r^2) turns back at r = 1 / sqrt(0.9) = 1.054.
         assert!(lens.project(Vector3::new(1.0, 0.0, 1.0)).is_some());
         assert_eq!(lens.project(Vector3::new(1.1, 0.0, 1.0)), None);

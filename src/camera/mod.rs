@@ -45,8 +45,10 @@ impl Camera {
         let ray_in_belt = self.camera_from_belt.transpose() * ray_in_camera;
         let centre = self.centre_in_belt();
         let scale = -centre.z / ray_in_belt.z;
-        (scale.is_finite() && scale > 0.0)
-            .then(|| BeltMm { x: centre.x + scale * ray_in_belt.x, y: centre.y + scale * ray_in_belt.y })
+        (scale.is_finite() && scale > 0.0).then(|| BeltMm {
+            x: centre.x + scale * ray_in_belt.x,
+            y: centre.y + scale * ray_in_belt.y,
+        })
     }
 
     /// Whether a raw pixel lies between the outermost pixel centres.

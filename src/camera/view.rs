@@ -70,7 +70,8 @@ impl BeltView {
             return self;
         }
         let (u0, v0) = (u_range.0.saturating_sub(GRID_PX), v_range.0.saturating_sub(GRID_PX));
-        let (u1, v1) = ((u_range.1 + GRID_PX).min(width - 1), (v_range.1 + GRID_PX).min(height - 1));
+        let (u1, v1) =
+            ((u_range.1 + GRID_PX).min(width - 1), (v_range.1 + GRID_PX).min(height - 1));
         Self {
             origin: self.belt_point(BeltPx { u: u0 as f64, v: v0 as f64 }),
             size_px: [u1 - u0 + 1, v1 - v0 + 1],
@@ -85,12 +86,18 @@ impl BeltView {
 
     /// Point of the belt plane at a view pixel.
     pub fn belt_point(&self, px: BeltPx) -> BeltMm {
-        BeltMm { x: self.origin.x + px.u * self.mm_per_px, y: self.origin.y - px.v * self.mm_per_px }
+        BeltMm {
+            x: self.origin.x + px.u * self.mm_per_px,
+            y: self.origin.y - px.v * self.mm_per_px,
+        }
     }
 
     /// View pixel of a point of the belt plane.
     pub fn px(&self, at: BeltMm) -> BeltPx {
-        BeltPx { u: (at.x - self.origin.x) / self.mm_per_px, v: (self.origin.y - at.y) / self.mm_per_px }
+        BeltPx {
+            u: (at.x - self.origin.x) / self.mm_per_px,
+            v: (self.origin.y - at.y) / self.mm_per_px,
+        }
     }
 
     /// Image, on the belt plane in mm, of a point `height_mm` above the belt.

@@ -105,11 +105,15 @@ fn check_zone_in_view(camera: &Camera, zone: &BeltRect) -> Result<()> {
 /// The belt seen along the middle lines of the image, for the error text.
 fn visible_range(camera: &Camera) -> String {
     let [width, height] = camera.image_size_px.map(|n| (n - 1) as f64);
-    let edge = [(0.0, height / 2.0), (width, height / 2.0), (width / 2.0, 0.0), (width / 2.0, height)];
+    let edge =
+        [(0.0, height / 2.0), (width, height / 2.0), (width / 2.0, 0.0), (width / 2.0, height)];
     let points = edge.map(|(x, y)| camera.belt_point(crate::units::RawPx { x, y }));
     let [Some(a), Some(b), Some(c), Some(d)] = points else { return String::new() };
     let range = |v: [f64; 4]| {
-        (v.into_iter().fold(f64::INFINITY, f64::min), v.into_iter().fold(f64::NEG_INFINITY, f64::max))
+        (
+            v.into_iter().fold(f64::INFINITY, f64::min),
+            v.into_iter().fold(f64::NEG_INFINITY, f64::max),
+        )
     };
     let (x, y) = (range([a.x, b.x, c.x, d.x]), range([a.y, b.y, c.y, d.y]));
     format!("; its middle lines reach x {:.0} to {:.0}, y {:.0} to {:.0} mm", x.0, x.1, y.0, y.1)

@@ -103,7 +103,13 @@ pub struct Background {
 
 impl Default for Background {
     fn default() -> Self {
-        Self { learn_frames: 15, history_frames: 500, threshold_sigma: 4.0, shadow_ratio_min: 0.72, deep_shadow_ratio_min: 0.3 }
+        Self {
+            learn_frames: 15,
+            history_frames: 500,
+            threshold_sigma: 4.0,
+            shadow_ratio_min: 0.72,
+            deep_shadow_ratio_min: 0.3,
+        }
     }
 }
 
@@ -205,7 +211,8 @@ impl Config {
     }
 
     fn check(&self) -> Result<()> {
-        let Self { camera: _, zone, belt, view, background, segment, odometry, limits, modbus } = self;
+        let Self { camera: _, zone, belt, view, background, segment, odometry, limits, modbus } =
+            self;
         for (key, mm) in [
             ("zone.x_min_mm", zone.x_min_mm),
             ("zone.x_max_mm", zone.x_max_mm),
@@ -214,8 +221,20 @@ impl Config {
         ] {
             range(key, mm, -20_000.0, 20_000.0, "mm")?;
         }
-        range("zone.x_max_mm - zone.x_min_mm", zone.x_max_mm - zone.x_min_mm, 50.0, 10_000.0, "mm")?;
-        range("zone.y_max_mm - zone.y_min_mm", zone.y_max_mm - zone.y_min_mm, 50.0, 10_000.0, "mm")?;
+        range(
+            "zone.x_max_mm - zone.x_min_mm",
+            zone.x_max_mm - zone.x_min_mm,
+            50.0,
+            10_000.0,
+            "mm",
+        )?;
+        range(
+            "zone.y_max_mm - zone.y_min_mm",
+            zone.y_max_mm - zone.y_min_mm,
+            50.0,
+            10_000.0,
+            "mm",
+        )?;
         range("belt.speed_mm_per_s", belt.speed_mm_per_s, 10.0, 10_000.0, "mm per s")?;
         if let Some(mm) = view.mm_per_px {
             range("view.mm_per_px", mm, 0.05, 20.0, "mm")?;

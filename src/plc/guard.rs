@@ -33,12 +33,10 @@ enum Verdict {
 
 fn judge(pdu: &[u8]) -> Verdict {
     match *pdu {
-        [READ_HOLDING | READ_INPUT, _, _, high, low] => {
-            match u16::from_be_bytes([high, low]) {
-                1..=READ_COUNT_MAX => Verdict::Forward,
-                _ => Verdict::Refuse(ILLEGAL_DATA_VALUE),
-            }
-        }
+        [READ_HOLDING | READ_INPUT, _, _, high, low] => match u16::from_be_bytes([high, low]) {
+            1..=READ_COUNT_MAX => Verdict::Forward,
+            _ => Verdict::Refuse(ILLEGAL_DATA_VALUE),
+        },
         [READ_HOLDING | READ_INPUT, ..] => Verdict::Refuse(ILLEGAL_DATA_VALUE),
         _ => Verdict::Refuse(ILLEGAL_FUNCTION),
     }
@@ -103,7 +101,13 @@ mod tests {
     fn only_whole_reads_of_1_to_125_registers_pass() {
         assert_eq!(judge(&[3, 0, 0, 0, 1]), Verdict::Forward);
         assert_eq!(judge(&[4, 255, 255, 0, 125]), Verdict::Forward);
-        for pdu in [&[3, 0, 0, 0, 0][..], &[3, 0, 0, 0, 126], &[3, 0, 0, 255, 255], &[3], &[4, 0, 0, 0, 1, 9]] {
+        for pdu in [
+            &[3, 0, 0, 0, 0][..],
+            &[3, 0, 0, 0, 126],
+            &[3, 0, 0, 255, 255],
+            &[3],
+            &[4, 0, 0, 0, 1, 9],
+        ] {
             assert_eq!(judge(pdu), Verdict::Refuse(ILLEGAL_DATA_VALUE), "{pdu:?}");
         }
         for function in (0..=255).filter(|f| ![READ_HOLDING, READ_INPUT].contains(f)) {
@@ -113,7 +117,8 @@ mod tests {
 
     /// Send bytes to a guard with no library behind it; returns what it answers.
     fn answer(bytes: &[u8]) -> Vec<u8> {
-        let runtime = tokio::runtime::Builder::new_current_thread().enable_all().build().expect("runtime");
+        let runtime =
+            tokio::runtime::Builder::new_current_thread().enable_all().build().expect("runtime");
         runtime.block_on(async {
             let (mut client, guarded) = tokio::io::duplex(1024);
             let (library, _other) = tokio::io::duplex(1024);

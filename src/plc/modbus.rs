@@ -30,7 +30,8 @@ type SharedImage = Arc<Mutex<RegisterImage>>;
 
 /// Bind the server's socket, before any thread is started.
 pub fn bind(settings: &Settings) -> Result<TcpListener> {
-    let bound = TcpListener::bind(settings.listen).and_then(|l| l.set_nonblocking(true).map(|()| l));
+    let bound =
+        TcpListener::bind(settings.listen).and_then(|l| l.set_nonblocking(true).map(|()| l));
     bound.map_err(|e| {
         let remedy = match e.kind() {
             std::io::ErrorKind::AddrInUse => "stop the other server, or choose another port",
@@ -54,7 +55,8 @@ pub fn serve(
     mut next: impl FnMut(&mut dyn FnMut(&ParcelRecord)) -> Option<Status>,
 ) -> Result<()> {
     let failed = |e: std::io::Error| Error::failure(format!("the Modbus server failed: {e}"));
-    let runtime = tokio::runtime::Builder::new_current_thread().enable_all().build().map_err(failed)?;
+    let runtime =
+        tokio::runtime::Builder::new_current_thread().enable_all().build().map_err(failed)?;
     runtime.block_on(async {
         let image: SharedImage = Arc::default();
         let listener = tokio::net::TcpListener::from_std(listener).map_err(failed)?;
@@ -96,9 +98,8 @@ async fn accept(listener: tokio::net::TcpListener, settings: Settings, image: Sh
         }
     };
     loop {
-        let ended: std::io::Result<()> = server
-            .serve::<Registers, DuplexStream, _, _, _>(&on_connected, |_| {})
-            .await;
+        let ended: std::io::Result<()> =
+            server.serve::<Registers, DuplexStream, _, _, _>(&on_connected, |_| {}).await;
         tracing::error!(?ended, "Modbus listener failed; trying again");
         tokio::time::sleep(ACCEPT_RETRY).await;
     }
@@ -109,9 +110,8 @@ struct Client(Arc<AtomicUsize>);
 
 impl Client {
     fn admit(clients: &Arc<AtomicUsize>, max: usize) -> Option<Self> {
-        let admitted = clients.fetch_update(Ordering::Relaxed, Ordering::Relaxed, |n| {
-            (n < max).then_some(n + 1)
-        });
+        let admitted = clients
+            .fetch_update(Ordering::Relaxed, Ordering::Relaxed, |n| (n < max).then_some(n + 1));
         admitted.ok().map(|_| Self(Arc::clone(clients)))
     }
 }

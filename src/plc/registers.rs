@@ -318,7 +318,8 @@ mod tests {
     #[test]
     fn values_out_of_range_saturate() {
         let mut image = RegisterImage::default();
-        let huge = ParcelRecord { length_mm: 1e9, width_mm: -3.0, height_mm: f64::NAN, ..record(1) };
+        let huge =
+            ParcelRecord { length_mm: 1e9, width_mm: -3.0, height_mm: f64::NAN, ..record(1) };
         image.publish(&huge);
         assert_eq!(image.read(LATEST + 4, 3), Some(&[65535, 0, 0][..]));
     }

@@ -64,42 +64,48 @@ pub fn draw(
     camera: &Camera,
     folder: &Path,
 ) -> Result<()> {
-        let mut canvas = Canvas::new(raw, width, height);
-        let (sin, cos) = record.yaw_deg.to_radians().sin_cos();
-        let corner = |a: f64, b: f64, z: f64| {
-            let (l, w) = (0.5 * a * record.length_mm, 0.5 * b * record.width_mm);
-            let at = Vector3::new(record.x_mm + cos * l - sin * w, record.y_mm + sin * l + cos * w, z);
-            camera.project(at).map(|px| Point::new(px.x.round() as i32, px.y.round() as i32))
-        };
-        let ring = [(1.0, -1.0), (1.0, 1.0), (-1.0, 1.0), (-1.0, -1.0)];
-        let [base, top] = [0.0, record.height_mm].map(|z| ring.map(|(a, b)| corner(a, b, z)));
-        for k in 0..4 {
-            canvas.line(base[k], base[(k + 1) % 4], BASE);
-            canvas.line(base[k], top[k], SIDE);
-            canvas.line(top[k], top[(k + 1) % 4], TOP);
-        }
-        let flags: Vec<_> =
-            crate::event::Flags::NAMES.iter().filter(|(f, _)| record.flags.has(*f)).map(|(_, n)| *n).collect();
-        let text = format!(
-            "#{} {:?}\nL {:.1} +- {:.1} mm\nW {:.1} +- {:.1} mm\nH {:.1} +- {:.1} mm\n{}",
-            record.seq,
-            record.shape,
-            record.length_mm,
-            record.sigma_length_mm,
-            record.width_mm,
-            record.sigma_width_mm,
-            record.height_mm,
-            record.sigma_height_mm,
-            flags.join(" ")
-        );
-        let seen = || base.iter().chain(&top).flatten();
-        let right = seen().map(|p| p.x).max().unwrap_or(0) + 10;
-        let above = seen().map(|p| p.y).min().unwrap_or(0);
-        canvas.text(&text, Point::new(right.clamp(4, width as i32 - 190), above.clamp(18, height as i32 - 90)));
-        let path = folder.join(format!("parcel_{:04}.png", record.seq));
-        image::save_buffer(&path, &canvas.rgb, width as u32, height as u32, image::ColorType::Rgb8)
-            .map_err(|e| Error::failure(format!("cannot write the picture: {e}")).in_file(&path))
+    let mut canvas = Canvas::new(raw, width, height);
+    let (sin, cos) = record.yaw_deg.to_radians().sin_cos();
+    let corner = |a: f64, b: f64, z: f64| {
+        let (l, w) = (0.5 * a * record.length_mm, 0.5 * b * record.width_mm);
+        let at = Vector3::new(record.x_mm + cos * l - sin * w, record.y_mm + sin * l + cos * w, z);
+        camera.project(at).map(|px| Point::new(px.x.round() as i32, px.y.round() as i32))
+    };
+    let ring = [(1.0, -1.0), (1.0, 1.0), (-1.0, 1.0), (-1.0, -1.0)];
+    let [base, top] = [0.0, record.height_mm].map(|z| ring.map(|(a, b)| corner(a, b, z)));
+    for k in 0..4 {
+        canvas.line(base[k], base[(k + 1) % 4], BASE);
+        canvas.line(base[k], top[k], SIDE);
+        canvas.line(top[k], top[(k + 1) % 4], TOP);
     }
+    let flags: Vec<_> = crate::event::Flags::NAMES
+        .iter()
+        .filter(|(f, _)| record.flags.has(*f))
+        .map(|(_, n)| *n)
+        .collect();
+    let text = format!(
+        "#{} {:?}\nL {:.1} +- {:.1} mm\nW {:.1} +- {:.1} mm\nH {:.1} +- {:.1} mm\n{}",
+        record.seq,
+        record.shape,
+        record.length_mm,
+        record.sigma_length_mm,
+        record.width_mm,
+        record.sigma_width_mm,
+        record.height_mm,
+        record.sigma_height_mm,
+        flags.join(" ")
+    );
+    let seen = || base.iter().chain(&top).flatten();
+    let right = seen().map(|p| p.x).max().unwrap_or(0) + 10;
+    let above = seen().map(|p| p.y).min().unwrap_or(0);
+    canvas.text(
+        &text,
+        Point::new(right.clamp(4, width as i32 - 190), above.clamp(18, height as i32 - 90)),
+    );
+    let path = folder.join(format!("parcel_{:04}.png", record.seq));
+    image::save_buffer(&path, &canvas.rgb, width as u32, height as u32, image::ColorType::Rgb8)
+        .map_err(|e| Error::failure(format!("cannot write the picture: {e}")).in_file(&path))
+}
 
 /// An RGB picture to draw on.
 struct Canvas {
@@ -128,7 +134,8 @@ impl Canvas {
 
     fn line(&mut self, from: Option<Point>, to: Option<Point>, colour: Rgb888) {
         if let (Some(from), Some(to)) = (from, to) {
-            let Ok(()) = Line::new(from, to).into_styled(PrimitiveStyle::with_stroke(colour, 2)).draw(self);
+            let Ok(()) =
+                Line::new(from, to).into_styled(PrimitiveStyle::with_stroke(colour, 2)).draw(self);
         }
     }
 
@@ -152,7 +159,10 @@ impl DrawTarget for Canvas {
     type Color = Rgb888;
     type Error = std::convert::Infallible;
 
-    fn draw_iter<I: IntoIterator<Item = Pixel<Rgb888>>>(&mut self, pixels: I) -> std::result::Result<(), Self::Error> {
+    fn draw_iter<I: IntoIterator<Item = Pixel<Rgb888>>>(
+        &mut self,
+        pixels: I,
+    ) -> std::result::Result<(), Self::Error> {
         for Pixel(at, colour) in pixels {
             let (Ok(x), Ok(y)) = (usize::try_from(at.x), usize::try_from(at.y)) else { continue };
             if x < self.width && y < self.height {

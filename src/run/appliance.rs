@@ -101,18 +101,26 @@ impl Appliance {
         let (pace, listener) = (self.pace, self.listener);
         let (buffers, pipeline) = super::memory::build(self.site)?;
         let shared = Shared::default();
-        let (mut free, mut ready) = (Queue::<Block<u8>, FRAME_RING>::new(), Queue::<Frame, FRAME_RING>::new());
+        let (mut free, mut ready) =
+            (Queue::<Block<u8>, FRAME_RING>::new(), Queue::<Frame, FRAME_RING>::new());
         let (mut to_plc, mut to_observer) =
             (Queue::<ParcelRecord, RECORD_RING>::new(), Queue::<ParcelRecord, RECORD_RING>::new());
         let ((mut free_in, free_out), (ready_in, ready_out)) = (free.split(), ready.split());
-        let ((plc_in, mut plc_out), (observer_in, mut observer_out)) = (to_plc.split(), to_observer.split());
+        let ((plc_in, mut plc_out), (observer_in, mut observer_out)) =
+            (to_plc.split(), to_observer.split());
         for buffer in buffers {
             // limits.frames_queued_max is below FRAME_RING.
             let _ = free_in.enqueue(buffer);
         }
         std::thread::scope(|scope| {
             let shared = &shared;
-            let vision = Vision { pipeline, ready: ready_out, free: free_in, records: [plc_in, observer_in], shared };
+            let vision = Vision {
+                pipeline,
+                ready: ready_out,
+                free: free_in,
+                records: [plc_in, observer_in],
+                shared,
+            };
             let vision = spawn(scope, "vision", move || vision.run())?;
             let waker = vision.thread().clone();
             let capture = Capture { source, pace, free: free_out, ready: ready_in, shared, waker };
@@ -265,7 +273,8 @@ impl Vision<'_> {
 
     fn publish(&self, frame_time: Duration, overflows: u64) {
         let (speed, measured) = self.pipeline.belt_motion();
-        let mut progress = self.shared.progress.lock().unwrap_or_else(std::sync::PoisonError::into_inner);
+        let mut progress =
+            self.shared.progress.lock().unwrap_or_else(std::sync::PoisonError::into_inner);
         let status = &mut progress.status;
         status.counters = self.pipeline.counters();
         status.counters.event_overflows = overflows;

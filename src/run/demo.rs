@@ -44,7 +44,9 @@ pub fn site(scenario: &Scenario) -> Result<Site> {
 /// Run the demo; returns the table of measured against true sizes.
 pub fn run(options: Options<'_>) -> Result<String> {
     if !(1.0..=3000.0).contains(&options.seconds) {
-        return Err(Error::configuration(format!("--seconds {}", options.seconds)).allowed("1 to 3000"));
+        return Err(
+            Error::configuration(format!("--seconds {}", options.seconds)).allowed("1 to 3000")
+        );
     }
     let scenario = scenario()?;
     let mut site = site(&scenario)?;
@@ -92,7 +94,10 @@ pub fn run(options: Options<'_>) -> Result<String> {
 fn console(progress: &Progress, elapsed: Duration, last: Option<&ParcelRecord>) {
     let status = &progress.status;
     let latest = last.map_or_else(String::new, |r| {
-        format!("  latest #{} {:.1} x {:.1} x {:.1} mm", r.seq, r.length_mm, r.width_mm, r.height_mm)
+        format!(
+            "  latest #{} {:.1} x {:.1} x {:.1} mm",
+            r.seq, r.length_mm, r.width_mm, r.height_mm
+        )
     });
     let line = format!(
         "{:5.1} s  frame {}  dropped {}  belt {:.1} mm/s{}  parcels {}{latest}",
@@ -126,7 +131,13 @@ fn table(scenario: &Scenario, records: &[ParcelRecord], progress: &Progress) -> 
         let triple = |v: [f64; 3]| format!("{:6.1} {:6.1} {:6.1}", v[0], v[1], v[2]);
         let flags = serde_json::to_string(&r.flags).unwrap_or_default();
         let Some(parcel) = truth(scenario, r) else {
-            let _ = writeln!(text, "{:3}  {:>22}    {}   belongs to no parcel  {flags}", r.seq, "-", triple(measured));
+            let _ = writeln!(
+                text,
+                "{:3}  {:>22}    {}   belongs to no parcel  {flags}",
+                r.seq,
+                "-",
+                triple(measured)
+            );
             continue;
         };
         let true_size = [parcel.length_mm, parcel.width_mm, parcel.height_mm];

@@ -30,7 +30,10 @@ pub fn measure(
     let expected = site.camera.image_size_px;
     if [width, height] != expected {
         return Err(Error::configuration(format!("the input has frames of {width} x {height} px"))
-            .allowed(format!("{} x {} px, the calibration's image_size_px", expected[0], expected[1]))
+            .allowed(format!(
+                "{} x {} px, the calibration's image_size_px",
+                expected[0], expected[1]
+            ))
             .remedy("use the calibration of this camera and image size"));
     }
     let mut annotator = outputs.annotate.map(|f| Annotator::new(f, [width, height])).transpose()?;

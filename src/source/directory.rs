@@ -73,10 +73,14 @@ impl FrameSource for Directory {
             .into_luma8();
         let [width, height] = self.size_px;
         if [image.width() as usize, image.height() as usize] != [width, height] {
-            return Err(Error::failure(format!("a frame of {} x {} px", image.width(), image.height()))
-                .in_file(&path)
-                .allowed(format!("{width} x {height} px, as the first frame"))
-                .remedy(remedy));
+            return Err(Error::failure(format!(
+                "a frame of {} x {} px",
+                image.width(),
+                image.height()
+            ))
+            .in_file(&path)
+            .allowed(format!("{width} x {height} px, as the first frame"))
+            .remedy(remedy));
         }
         frame.copy_from_slice(image.as_raw());
         let index = self.next_index;

@@ -45,8 +45,7 @@ pub fn open(input: &Path, fps: Option<f64>) -> Result<Box<dyn FrameSource>> {
     if metadata.is_dir() {
         return Ok(Box::new(Directory::open(input, fps)?));
     }
-    let file = std::fs::File::open(input).map_err(|e| {
-        Error::failure(format!("cannot open the input: {e}")).in_file(input)
-    })?;
+    let file = std::fs::File::open(input)
+        .map_err(|e| Error::failure(format!("cannot open the input: {e}")).in_file(input))?;
     Ok(Box::new(Y4m::new(Box::new(file), &input.display().to_string(), fps)?))
 }

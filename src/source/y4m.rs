@@ -38,7 +38,8 @@ impl Y4m {
         if fields.next() != Some("YUV4MPEG2") {
             return Err(wrong("the input is not a YUV4MPEG2 stream".to_owned()));
         }
-        let (mut width, mut height, mut rate, mut chroma) = (None, None, None, "420jpeg".to_owned());
+        let (mut width, mut height, mut rate, mut chroma) =
+            (None, None, None, "420jpeg".to_owned());
         for field in fields.filter(|f| !f.is_empty()) {
             let (tag, value) = field.split_at(field.chars().next().map_or(0, char::len_utf8));
             match tag {
@@ -57,7 +58,9 @@ impl Y4m {
         let (width, height) = (side(width, "width W")?, side(height, "height H")?);
         let chroma_bytes = match chroma.as_str() {
             "mono" => 0,
-            "420" | "420jpeg" | "420mpeg2" | "420paldv" => 2 * width.div_ceil(2) * height.div_ceil(2),
+            "420" | "420jpeg" | "420mpeg2" | "420paldv" => {
+                2 * width.div_ceil(2) * height.div_ceil(2)
+            }
             other => return Err(wrong(format!("colour space C{other} is not supported"))),
         };
         let fps = fps

@@ -137,8 +137,11 @@ impl Background {
                 let model = mean[v * width + u];
                 let visible = seen[v * n + u / 64] >> (u % 64) & 1 == 1;
                 let bin = u32::from(row[u]) * 256 * GAIN_BIN_ONE / u32::from(model.max(1));
-                (visible && model >= GAIN_MEAN_MIN)
-                    .then_some((row[u], model, (bin as usize).min(GAIN_BINS - 1)))
+                (visible && model >= GAIN_MEAN_MIN).then_some((
+                    row[u],
+                    model,
+                    (bin as usize).min(GAIN_BINS - 1),
+                ))
             })
         };
         let rows = || (0..view.height()).step_by(GAIN_GRID_PX);

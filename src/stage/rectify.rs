@@ -71,7 +71,10 @@ fn source(camera: &Camera, px: RawPx) -> Option<Source> {
     let fixed = |value: f64, side: usize| {
         let steps = (value * one).round();
         let inside = steps >= 0.0 && steps < (side - 1) as f64 * one;
-        inside.then_some((steps as u32 / u32::from(FRACTION_ONE), steps as u32 % u32::from(FRACTION_ONE)))
+        inside.then_some((
+            steps as u32 / u32::from(FRACTION_ONE),
+            steps as u32 % u32::from(FRACTION_ONE),
+        ))
     };
     let [width, height] = camera.image_size_px;
     let ((x, fx), (y, fy)) = (fixed(px.x, width)?, fixed(px.y, height)?);

@@ -161,7 +161,8 @@ impl Segment {
         }
         let mut kept = 0;
         for i in 0..count {
-            let beyond_doubt = f64::from(blobs[i].strong_px) >= STRONG_SHARE_MIN * f64::from(blobs[i].area_px);
+            let beyond_doubt =
+                f64::from(blobs[i].strong_px) >= STRONG_SHARE_MIN * f64::from(blobs[i].area_px);
             if blobs[i].area_px >= self.area_min_px && beyond_doubt {
                 blobs[kept] = blobs[i];
                 kept += 1;
@@ -193,7 +194,8 @@ fn count_bits(row: &[u64], start: u16, end: u16) -> u32 {
     let to = u64::MAX >> (63 - (end - 1) % 64);
     (first..=last)
         .map(|w| {
-            let mask = if w == first { from } else { u64::MAX } & if w == last { to } else { u64::MAX };
+            let mask =
+                if w == first { from } else { u64::MAX } & if w == last { to } else { u64::MAX };
             (row[w] & mask).count_ones()
         })
         .sum()

@@ -130,7 +130,14 @@ impl Tracker {
     }
 
     /// Carry the tracks on by `step_mm` of belt travel and give them their blobs.
-    pub fn step(&mut self, blobs: &[Blob], step_mm: f64, at: BeltPosition) {
+    /// `belongs`: whether a blob is part of the parcel measured on a slot.
+    pub fn step(
+        &mut self,
+        blobs: &[Blob],
+        step_mm: f64,
+        at: BeltPosition,
+        belongs: &dyn Fn(usize, &Blob) -> bool,
+    ) {
         self.changes.clear();
         self.owners.fill(NOBODY);
         let step_px = step_mm / self.mm_per_px;
@@ -144,7 +151,7 @@ impl Tracker {
             track.frames = track.frames.saturating_add(1);
         }
         for blob in blobs {
-            self.assign(blob);
+            self.assign(blob, belongs);
         }
         self.gather(blobs, step_px);
         for blob in blobs {
@@ -155,8 +162,9 @@ impl Tracker {
         self.judge(at);
     }
 
-    /// Give a blob to the track that it overlaps most; several parcels on one blob are merged.
-    fn assign(&mut self, blob: &Blob) {
+    /// Give a blob to the parcel whose cuboid it is part of, else to the track that it overlaps
+    /// most; several parcels on one blob are merged.
+    fn assign(&mut self, blob: &Blob, belongs: &dyn Fn(usize, &Blob) -> bool) {
         let overlap = |t: &Track| {
             let smaller = t.bounds.area().min(blob.bounds.area());
             if t.phase == Phase::Free { 0.0 } else { t.bounds.overlap(&blob.bounds) / smaller }
@@ -170,7 +178,11 @@ impl Tracker {
                     area(a).total_cmp(&area(b))
                 })
         };
-        let Some(owner) = best(YOUNG_FRAMES).or_else(|| best(0)) else { return };
+        let part_of = (0..self.tracks.len())
+            .filter(|&s| self.tracks[s].phase != Phase::Free && belongs(s, blob))
+            .max_by_key(|&s| self.tracks[s].frames);
+        let owner = part_of.or_else(|| best(YOUNG_FRAMES)).or_else(|| best(0));
+        let Some(owner) = owner else { return };
         self.owners[blob.label as usize] = owner as u16;
         let mut shared = false;
         for s in (0..self.tracks.len()).filter(|&s| s != owner) {

@@ -170,8 +170,7 @@ fn move_mode(x: u16, mode: &mut ModeRow<'_>, i: usize, rate: u32, weight: u32) {
     };
     let d2 = i64::from(squared(x, mode.mean[i]) >> 8);
     mode.mean[i] = follow(mode.mean[i], i64::from(x)) as u16;
-    mode.variance[i] =
-        follow(mode.variance[i], d2).clamp(i64::from(VARIANCE_MIN), 65535) as u16;
+    mode.variance[i] = follow(mode.variance[i], d2).clamp(i64::from(VARIANCE_MIN), 65535) as u16;
 }
 
 /// Keep modes in order of weight.

@@ -51,15 +51,15 @@ pub fn steps(profile: &[f32], slope_min: f32, steps: &mut [Step]) -> usize {
     for i in 3..profile.len().saturating_sub(3) {
         let (before, here, after) = (slope(i - 1), slope(i), slope(i + 1));
         let sign = here.signum();
-        let peak = here * sign >= slope_min && here * sign > before * sign && here * sign >= after * sign;
+        let peak =
+            here * sign >= slope_min && here * sign > before * sign && here * sign >= after * sign;
         if !peak {
             continue;
         }
         let curvature = before - 2.0 * here + after;
         let offset = if curvature == 0.0 { 0.0 } else { 0.5 * (before - after) / curvature };
         let step = Step { at: i as f32 + offset.clamp(-0.5, 0.5), slope: here };
-        let rank =
-            steps[..count].iter().position(|s| s.slope.abs() < here.abs()).unwrap_or(count);
+        let rank = steps[..count].iter().position(|s| s.slope.abs() < here.abs()).unwrap_or(count);
         if rank < steps.len() {
             count = (count + 1).min(steps.len());
             steps[rank..count].rotate_right(1);

@@ -153,8 +153,10 @@ mod tests {
                         .collect()
                 })
                 .collect();
-            let text: Vec<String> =
-                grid.iter().map(|r| r.iter().map(|&b| if b { '#' } else { '.' }).collect()).collect();
+            let text: Vec<String> = grid
+                .iter()
+                .map(|r| r.iter().map(|&b| if b { '#' } else { '.' }).collect())
+                .collect();
             let lines: Vec<&str> = text.iter().map(String::as_str).collect();
             assert_eq!(label(&lines).0, flood_fill(grid), "density {density}");
         }
@@ -173,7 +175,9 @@ mod tests {
                 while let Some((y, x)) = stack.pop() {
                     if std::mem::take(&mut grid[y][x]) {
                         for ny in y.saturating_sub(1)..(y + 2).min(rows) {
-                            stack.extend((x.saturating_sub(1)..(x + 2).min(width)).map(|nx| (ny, nx)));
+                            stack.extend(
+                                (x.saturating_sub(1)..(x + 2).min(width)).map(|nx| (ny, nx)),
+                            );
                         }
                     }
                 }

@@ -146,9 +146,8 @@ impl Renderer {
     fn solids(&self, travel_mm: f64) -> Vec<Solid> {
         let mut solids: Vec<Solid> =
             self.scenario.parcels().iter().filter_map(|p| self.solid(p, travel_mm)).collect();
-        let distance = |s: &Solid| {
-            (s.centre[0] - self.centre[0]).hypot(s.centre[1] - self.centre[1])
-        };
+        let distance =
+            |s: &Solid| (s.centre[0] - self.centre[0]).hypot(s.centre[1] - self.centre[1]);
         solids.sort_by(|a, b| distance(b).total_cmp(&distance(a)));
         solids
     }
@@ -166,7 +165,12 @@ impl Renderer {
             let b = sign(1) * (0.5 * parcel.width_mm + margin_mm);
             let at = Vector3::new(x_mm + cos * a - sin * b, parcel.y_mm + sin * a + cos * b, z);
             let px = self.camera.project(at)?;
-            bounds = [bounds[0].min(px.x), bounds[1].max(px.x), bounds[2].min(px.y), bounds[3].max(px.y)];
+            bounds = [
+                bounds[0].min(px.x),
+                bounds[1].max(px.x),
+                bounds[2].min(px.y),
+                bounds[3].max(px.y),
+            ];
         }
         let [width, height] = self.camera.image_size_px;
         // Neighbours are needed for derivatives and edges.
@@ -222,7 +226,8 @@ impl Renderer {
         for v in v0 + 1..v1 - 1 {
             for i in v * width + u0 + 1..v * width + u1 - 1 {
                 let here = self.surface[i];
-                let plain = [i - 1, i + 1, i - width, i + width].iter().all(|&n| self.surface[n] == here);
+                let plain =
+                    [i - 1, i + 1, i - width, i + width].iter().all(|&n| self.surface[n] == here);
                 if plain && here == NOTHING {
                     continue;
                 }
@@ -243,9 +248,8 @@ impl Renderer {
     /// Mean over the pixel's area and the exposure; `behind` shows where the solid does not.
     fn supersample(&self, solid: &Solid, i: usize, shade: f32, blur_mm: f32, behind: f32) -> f32 {
         let width = self.camera.image_size_px[0];
-        let difference = |a: usize, b: usize| {
-            [0, 1].map(|k| 0.5 * (self.ground[a][k] - self.ground[b][k]))
-        };
+        let difference =
+            |a: usize, b: usize| [0, 1].map(|k| 0.5 * (self.ground[a][k] - self.ground[b][k]));
         let (du, dv) = (difference(i + 1, i - 1), difference(i + width, i - width));
         let mut sum = 0.0;
         for k in 0..SUB * SUB {
@@ -307,14 +311,18 @@ impl Solid {
         let plain = match self.parcel.material {
             Material::Kraft => 105.0,
             Material::White => 190.0,
-            Material::Dark => 24.0,
+            Material::Dark => 20.0,
         };
         // A label in one quarter, up to 80 x 50 mm.
         let label = [(0.4 * self.half[0]).min(40.0), (0.4 * self.half[1]).min(25.0)];
         let (la, lb) = (a + 0.45 * self.half[0], b - 0.4 * self.half[1]);
         if la.abs() < label[0] && lb.abs() < label[1] {
             let bar = lb < 0.0 && ((la + label[0]) / 3.0) as u32 % 2 == 1;
-            return if bar { Hit { surface: 3, grey: 40.0 } } else { Hit { surface: 2, grey: 215.0 } };
+            return if bar {
+                Hit { surface: 3, grey: 40.0 }
+            } else {
+                Hit { surface: 2, grey: 215.0 }
+            };
         }
         let tape_half = (0.25 * self.half[1]).min(25.0);
         if self.parcel.material == Material::Kraft && b.abs() < tape_half {
@@ -328,7 +336,7 @@ impl Solid {
         let top = match self.parcel.material {
             Material::Kraft => 105.0,
             Material::White => 190.0,
-            Material::Dark => 24.0,
+            Material::Dark => 20.0,
         };
         let turned = [0.45, 0.55, 0.5, 0.6][face - 1];
         let lower = 0.7 + 0.3 * (z_mm / self.height).clamp(0.0, 1.0);

@@ -227,7 +227,15 @@ impl RandomTable {
             };
             let height_mm = random.between(self.height_mm);
             let y_mm = random.between(self.y_mm);
-            parcels.push(Parcel { length_mm, width_mm, height_mm, yaw_deg, x_mm: end_mm, y_mm, material });
+            parcels.push(Parcel {
+                length_mm,
+                width_mm,
+                height_mm,
+                yaw_deg,
+                x_mm: end_mm,
+                y_mm,
+                material,
+            });
             end_mm -= half_mm;
         }
         parcels

@@ -5,7 +5,9 @@
 //! closes. The silhouettes stay in with low weight: they guard the choice of edges.
 //! Source: Nocedal and Wright, chapter 10; Huber 1964 and Tukey's biweight for outliers.
 
-use super::model::{EDGES, HEIGHT, LENGTH, N, Outline, Params, SCALE, WIDTH, X, Y, YAW, canonical};
+use super::model::{
+    EDGES, EdgeId, HEIGHT, LENGTH, N, Outline, Params, SCALE, WIDTH, X, Y, YAW, canonical,
+};
 use super::observe::{DIRECTIONS, EdgeSample, View, direction};
 use crate::camera::BeltView;
 use crate::units::BeltRect;
@@ -32,6 +34,10 @@ const VOTE_SLOPE_MAX: f32 = 4.0;
 const VOTE_SHARE: f64 = 0.85;
 /// A base edge nearer than this to its top edge cannot be told from it.
 const SIDE_DEPTH_MIN_PX: f64 = 4.0;
+/// A side narrower than this does not disturb its top edge.
+const SIDE_DEPTH_NONE_PX: f64 = 0.3;
+/// In between, a top edge counts this much: enough when there is nothing better.
+const NARROW_SIDE_TRUST: f64 = 0.05;
 /// Profiles on neighbouring places and frames share their errors; this many count as one.
 const CORRELATED_SAMPLES: f64 = 20.0;
 /// Below this no dimension is trusted, mm: lens model, edge rounding.
@@ -180,7 +186,13 @@ impl Problem<'_> {
         let mut last = None;
         for gate_px in GATES_PX {
             let (mut normal, reach_error) = self.reach_normal(views, &params, REACH_GUARD_SIGMA_MM);
-            let used = self.add_edges(views, &params, gate_px * self.geometry.mm_per_px, &polarity, &mut normal);
+            let used = self.add_edges(
+                views,
+                &params,
+                gate_px * self.geometry.mm_per_px,
+                &polarity,
+                &mut normal,
+            );
             if gate_px <= POLARITY_GATE_PX {
                 polarity = used.polarity;
             }
@@ -197,7 +209,8 @@ impl Problem<'_> {
         let mut depth = [(0.0, 0u32); 4];
         let mut sampled = 0;
         for view in views.iter().filter(|v| !v.samples().is_empty()) {
-            let outline = Outline::new(self.geometry, params, view.travel_mm - self.reference_travel_mm);
+            let outline =
+                Outline::new(self.geometry, params, view.travel_mm - self.reference_travel_mm);
             sampled += 1;
             for (k, (sum, count)) in depth.iter_mut().enumerate() {
                 if outline.side_visible[k] {
@@ -222,9 +235,11 @@ impl Problem<'_> {
             let (sum, count) = depth[k];
             let mean = sum / f64::from(count.max(1));
             // A side seen in passing shows its base edge smeared: no peak to mistake.
-            let confusing = 2 * count > sampled && mean > SIDE_DEPTH_MIN_PX * self.geometry.mm_per_px;
+            let confusing =
+                2 * count > sampled && mean > SIDE_DEPTH_MIN_PX * self.geometry.mm_per_px;
             FaceVote {
-                offset_mm: outermost_peak(&votes[k]).map_or(0.0, |px| px * self.geometry.mm_per_px / m),
+                offset_mm: outermost_peak(&votes[k])
+                    .map_or(0.0, |px| px * self.geometry.mm_per_px / m),
                 side_depth_mm: confusing.then_some(mean / m),
             }
         })
@@ -264,7 +279,6 @@ impl Problem<'_> {
         for i in [X, Y, LENGTH, WIDTH, HEIGHT] {
             sigma[i] = sigma[i].hypot(SIGMA_FLOOR_MM);
         }
-        if std::env::var_os("DBG").is_some() && used.used > 0 { eprintln!("FIT scale {:.5} +- {:.5} H {:.2}+-{:.2} excess {:.2} used {} of {} reach {:.2}", params[SCALE], sigma[SCALE], params[HEIGHT], sigma[HEIGHT], excess, used.used, used.offered, reach_error); }
         Some(Estimate {
             params,
             sigma,
@@ -281,11 +295,11 @@ impl Problem<'_> {
         let reach = |k: usize| f64::from(view.reach_mm[self.silhouette as usize][k % DIRECTIONS]);
         let extent = |k: usize| reach(k) + reach(k + DIRECTIONS / 2);
         let quarter = DIRECTIONS / 4;
-        let k = (0..quarter)
-            .filter(|&k| (extent(k) * extent(k + quarter)).is_finite())
-            .min_by(|&a, &b| {
+        let k = (0..quarter).filter(|&k| (extent(k) * extent(k + quarter)).is_finite()).min_by(
+            |&a, &b| {
                 (extent(a) * extent(a + quarter)).total_cmp(&(extent(b) * extent(b + quarter)))
-            })?;
+            },
+        )?;
         let middle = |k: usize| 0.5 * (reach(k) - reach(k + DIRECTIONS / 2));
         let image = direction(k) * middle(k) + direction(k + quarter) * middle(k + quarter);
         let m = self.geometry.magnification(height_mm);
@@ -337,8 +351,13 @@ impl Problem<'_> {
         let mut normal = Normal::new();
         let (mut squares, mut count) = (0.0, 0);
         for view in views {
-            let outline = Outline::new(self.geometry, params, view.travel_mm - self.reference_travel_mm);
-            for (k, &reach) in view.reach_mm[self.silhouette as usize].iter().enumerate().filter(|(_, r)| r.is_finite()) {
+            let outline =
+                Outline::new(self.geometry, params, view.travel_mm - self.reference_travel_mm);
+            for (k, &reach) in view.reach_mm[self.silhouette as usize]
+                .iter()
+                .enumerate()
+                .filter(|(_, r)| r.is_finite())
+            {
                 let d = direction(k);
                 let vertex = outline.support(d);
                 let residual = f64::from(reach) - vertex.image.dot(&d);
@@ -370,25 +389,37 @@ impl Problem<'_> {
         let mut used = EdgeUse::default();
         let sigma_mm = EDGE_SIGMA_PX * self.geometry.mm_per_px;
         for view in views.iter().filter(|v| !v.samples().is_empty()) {
-            let outline = Outline::new(self.geometry, params, view.travel_mm - self.reference_travel_mm);
-            let usable: [bool; EDGES] = std::array::from_fn(|e| {
-                let edge = super::model::EdgeId(e as u8);
-                let apart = outline.side_depth_mm(edge.face()) > SIDE_DEPTH_MIN_PX * self.geometry.mm_per_px;
-                outline.visible(edge) && (apart || !edge.is_base())
+            let outline =
+                Outline::new(self.geometry, params, view.travel_mm - self.reference_travel_mm);
+            let trust: [f64; EDGES] = std::array::from_fn(|e| {
+                let edge = EdgeId(e as u8);
+                let depth_px = outline.side_depth_mm(edge.face()) / self.geometry.mm_per_px;
+                let facing = outline.side_visible[edge.face()];
+                // A narrow side blurs its two edges into one place that is neither.
+                let distinct =
+                    !facing || depth_px > SIDE_DEPTH_MIN_PX || depth_px < SIDE_DEPTH_NONE_PX;
+                match (outline.visible(edge), distinct) {
+                    (false, _) => 0.0,
+                    (true, true) => 1.0,
+                    (true, false) if edge.is_base() => 0.0,
+                    (true, false) => NARROW_SIDE_TRUST,
+                }
             });
             for sample in view.samples() {
                 let e = usize::from(sample.edge.0);
-                if !usable[e] {
+                if trust[e] == 0.0 {
                     continue;
                 }
                 let Some((at, row)) = self.predict(&outline, sample) else { continue };
                 used.offered += 1;
-                let Some((residual, slope)) = choose(sample, at, gate_mm, polarity[e]) else { continue };
+                let Some((residual, slope)) = choose(sample, at, gate_mm, polarity[e]) else {
+                    continue;
+                };
                 used.used += 1;
                 used.squares += residual * residual;
                 used.polarity[e] += f64::from(slope.signum());
                 let share = residual / gate_mm;
-                let biweight = (1.0 - share * share).powi(2);
+                let biweight = trust[e] * (1.0 - share * share).powi(2);
                 used.contrast += biweight * f64::from(slope.abs().min(VOTE_SLOPE_MAX));
                 normal.add(residual, &row, biweight / (CORRELATED_SAMPLES * sigma_mm * sigma_mm));
             }
@@ -435,7 +466,12 @@ fn outermost_peak(votes: &[f64; VOTE_BINS]) -> Option<f64> {
 
 /// The step that belongs to the predicted edge: inside the gate, of the edge's polarity once
 /// that is known, the strongest for its distance. Returns residual and slope.
-fn choose(sample: &EdgeSample, predicted_mm: f64, gate_mm: f64, polarity: f64) -> Option<(f64, f32)> {
+fn choose(
+    sample: &EdgeSample,
+    predicted_mm: f64,
+    gate_mm: f64,
+    polarity: f64,
+) -> Option<(f64, f32)> {
     let mut best: Option<(f64, f64, f32)> = None;
     for step in sample.steps.iter().filter(|s| s.slope != 0.0) {
         let residual = f64::from(step.at) - predicted_mm;

@@ -3,6 +3,7 @@
 //! Source: DESIGN "known motion". A point at height h over the belt point q appears at
 //! `nadir + m (q - nadir)` with `m = Zc / (Zc - h)`, in mm on the belt plane.
 
+use super::observe::{DIRECTIONS, direction};
 use crate::camera::BeltView;
 use nalgebra::{SMatrix, SVector, Vector2};
 
@@ -138,6 +139,13 @@ impl Outline {
         best
     }
 
+    /// Whether a point of the belt plane lies in the silhouette, or within `margin_mm` of it.
+    pub fn covers(&self, at: Vector2<f64>, margin_mm: f64) -> bool {
+        (0..DIRECTIONS)
+            .map(direction)
+            .all(|d| at.dot(&d) <= self.support(d).image.dot(&d) + margin_mm)
+    }
+
     /// The upstream end on the belt, mm.
     pub fn trailing_x_mm(&self) -> f64 {
         self.base.iter().map(|v| v.over_belt.x).fold(f64::INFINITY, f64::min)
@@ -194,14 +202,27 @@ mod tests {
     }
 
     #[test]
+    fn a_silhouette_covers_its_corners_and_not_its_neighbours() {
+        let outline =
+            Outline::new(&view(), &Params::from([300.0, -7.0, 0.3, 90.0, 50.0, 40.0, 1.0]), 0.0);
+        for vertex in outline.base.iter().chain(&outline.top) {
+            assert!(outline.covers(vertex.image, 1e-9));
+        }
+        assert!(!outline.covers(Vector2::new(300.0, 60.0), 5.0));
+        assert!(outline.covers(Vector2::new(300.0, 40.0), 30.0));
+    }
+
+    #[test]
     fn sides_facing_the_nadir_are_visible() {
-        let outline = Outline::new(&view(), &Params::from([300.0, -7.0, 0.0, 50.0, 50.0, 40.0, 1.0]), 0.0);
+        let outline =
+            Outline::new(&view(), &Params::from([300.0, -7.0, 0.0, 50.0, 50.0, 40.0, 1.0]), 0.0);
         assert_eq!(outline.side_visible, [false, false, true, false]);
     }
 
     #[test]
     fn a_cuboid_under_the_camera_shows_no_side() {
-        let outline = Outline::new(&view(), &Params::from([12.0, -7.0, 0.3, 50.0, 50.0, 40.0, 1.0]), 0.0);
+        let outline =
+            Outline::new(&view(), &Params::from([12.0, -7.0, 0.3, 50.0, 50.0, 40.0, 1.0]), 0.0);
         assert_eq!(outline.side_visible, [false; 4]);
     }
 
@@ -214,7 +235,8 @@ mod tests {
                 assert!(c[LENGTH] >= c[WIDTH]);
                 assert!(c[YAW] > -std::f64::consts::FRAC_PI_2 - 1e-12);
                 assert!(c[YAW] <= std::f64::consts::FRAC_PI_2 + 1e-12);
-                let (before, after) = (Outline::new(&view(), &params, 0.0), Outline::new(&view(), &c, 0.0));
+                let (before, after) =
+                    (Outline::new(&view(), &params, 0.0), Outline::new(&view(), &c, 0.0));
                 for v in &before.top {
                     assert!(after.top.iter().any(|o| (o.image - v.image).norm() < 1e-9));
                 }

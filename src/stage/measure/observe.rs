@@ -164,11 +164,15 @@ impl Frame<'_> {
         let in_zone = (self.zone.x_min_mm..=self.zone.x_max_mm).contains(&at.x);
         let [width, height] = self.view.size_px;
         let (u, v) = (px.u as usize, px.v as usize);
-        let inside = (2..width.saturating_sub(2)).contains(&u) && (2..height.saturating_sub(2)).contains(&v);
-        let is_seen = |u: usize, v: usize| self.seen[v * words(width) + u / 64] >> (u % 64) & 1 == 1;
+        let inside =
+            (2..width.saturating_sub(2)).contains(&u) && (2..height.saturating_sub(2)).contains(&v);
+        let is_seen =
+            |u: usize, v: usize| self.seen[v * words(width) + u / 64] >> (u % 64) & 1 == 1;
         in_zone
             && inside
-            && [(u - 2, v), (u + 2, v), (u, v - 2), (u, v + 2)].into_iter().all(|(u, v)| is_seen(u, v))
+            && [(u - 2, v), (u + 2, v), (u, v - 2), (u, v + 2)]
+                .into_iter()
+                .all(|(u, v)| is_seen(u, v))
     }
 
     /// Take profiles across the visible edges of a predicted outline.
@@ -178,7 +182,8 @@ impl Frame<'_> {
             let ends = outline.ends(edge);
             for i in 0..SAMPLES_PER_EDGE {
                 let t = (i as f64 + 0.5) / SAMPLES_PER_EDGE as f64;
-                let over_belt_x = ends[0].over_belt.x + t * (ends[1].over_belt.x - ends[0].over_belt.x);
+                let over_belt_x =
+                    ends[0].over_belt.x + t * (ends[1].over_belt.x - ends[0].over_belt.x);
                 if !(self.zone.x_min_mm..=self.zone.x_max_mm).contains(&over_belt_x) {
                     continue;
                 }
@@ -193,7 +198,12 @@ impl Frame<'_> {
     }
 
     /// One profile; `None` where it leaves the view or finds no step.
-    fn sample_edge(&self, edge: EdgeId, anchor: Vector2<f64>, outward: Vector2<f64>) -> Option<EdgeSample> {
+    fn sample_edge(
+        &self,
+        edge: EdgeId,
+        anchor: Vector2<f64>,
+        outward: Vector2<f64>,
+    ) -> Option<EdgeSample> {
         let px = self.view.px(BeltMm { x: anchor.x, y: anchor.y });
         // In pixels the y axis points down.
         let step = [outward.x as f32, -outward.y as f32];
