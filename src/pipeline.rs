@@ -74,7 +74,7 @@ impl Pipeline {
         let (size, limits) = (site.view.size_px, &site.config.limits);
         Rectify::plan(&site.view, plan);
         Background::plan(size, plan);
-        Odometry::plan(&site.view, &site.config.zone.rect(), plan);
+        Odometry::plan(&site.view, &site.config.zone, plan);
         Segment::plan(size, limits, plan);
         Tracker::plan(limits.tracks_max, limits.blobs_max, plan);
         Measure::plan(limits.tracks_max, limits.views_per_track_max, plan);
@@ -87,7 +87,7 @@ impl Pipeline {
 
     /// Take the planned memory and compute the tables.
     pub fn new(site: Site, memory: &mut Memory) -> Result<Self> {
-        let (zone, view, config) = (site.config.zone.rect(), &site.view, &site.config);
+        let (zone, view, config) = (site.config.zone, &site.view, &site.config);
         let magnification_max = view.magnification(site.height_max_mm);
         let start = FrameTime { index: 0, t_s: 0.0 };
         let nowhere = Reference {
@@ -287,12 +287,11 @@ impl Pipeline {
             if track.phase != Phase::Riding {
                 continue;
             }
-            let trailing_mm = match self.measure.outline(slot, self.at) {
-                Some(outline) => outline.trailing_x_mm(),
-                None => {
-                    let px = BeltPx { u: f64::from(track.bounds.u0), v: 0.0 };
-                    self.site.view.belt_point(px).x
-                }
+            let trailing_mm = if let Some(outline) = self.measure.outline(slot, self.at) {
+                outline.trailing_x_mm()
+            } else {
+                let px = BeltPx { u: f64::from(track.bounds.u0), v: 0.0 };
+                self.site.view.belt_point(px).x
             };
             if trailing_mm > self.zone.x_max_mm {
                 self.emit(slot, Flags::default(), emit);

@@ -1,7 +1,7 @@
 //! Units and frames, as types where mixing them up would compile.
 //!
 //! Two pixel frames exist and never mix: [`RawPx`] is the camera's image, [`BeltPx`] the
-//! rectified belt view. Both follow OpenCV: the centre of the top-left pixel is (0, 0).
+//! rectified belt view. Both follow `OpenCV`: the centre of the top-left pixel is (0, 0).
 //! Millimetres on the belt plane are [`BeltMm`]: +x along travel, +y to the left seen
 //! along travel, origin under the camera centre. Scalars carry their unit in their name.
 
@@ -33,7 +33,8 @@ pub struct BeltMm {
 }
 
 /// An axis-aligned rectangle on the belt plane, in mm.
-#[derive(Clone, Copy, Debug, PartialEq)]
+#[derive(Clone, Copy, Debug, PartialEq, serde::Deserialize)]
+#[serde(deny_unknown_fields)]
 pub struct BeltRect {
     /// Upstream end.
     pub x_min_mm: f64,

@@ -1,6 +1,6 @@
 //! Lens models `brown` (Brown-Conrady, k1 k2 p1 p2 k3) and `fisheye` (Kannala-Brandt, k1..k4).
 //!
-//! Source: OpenCV's calib3d and fisheye modules; Kannala and Brandt 2006, eq. 6.
+//! Source: `OpenCV`'s calib3d and fisheye modules; Kannala and Brandt 2006, eq. 6.
 
 use crate::units::RawPx;
 use nalgebra::{Matrix2, Vector2, Vector3};
@@ -177,8 +177,8 @@ impl Lens {
 mod tests {
     use super::*;
 
-    const BROWN_OPENCV: [f64; 2] = [1239.015263615, 399.803498292];
-    const FISHEYE_OPENCV: [f64; 2] = [1121.612494575, 492.065941123];
+    const BROWN_OPENCV: [f64; 2] = [1_239.015_263_615, 399.803_498_292];
+    const FISHEYE_OPENCV: [f64; 2] = [1_121.612_494_575, 492.065_941_123];
 
     fn lenses() -> [Lens; 2] {
         [
@@ -215,7 +215,7 @@ mod tests {
         }
     }
 
-    /// Values printed by OpenCV 5.0 `projectPoints` for the point (300, -200, 1000).
+    /// Values that `cv::projectPoints` 5.0 prints for the point (300, -200, 1000).
     #[test]
     fn brown_matches_opencv() {
         let [brown, _] = lenses();
@@ -223,7 +223,7 @@ mod tests {
         assert!((px.x - BROWN_OPENCV[0]).hypot(px.y - BROWN_OPENCV[1]) < 1e-6, "{px:?}");
     }
 
-    /// Values printed by OpenCV 5.0 `fisheye::projectPoints` for the same point.
+    /// Values that `cv::fisheye::projectPoints` 5.0 prints for the same point.
     #[test]
     fn fisheye_matches_opencv() {
         let [_, fisheye] = lenses();

@@ -2,7 +2,7 @@
 //!
 //! Frames: `camera` is x right, y down, z forward; `belt` is [`crate::units::BeltMm`] plus
 //! height above the belt. A transform is named `target_from_source`.
-//! Source: Hartley and Zisserman, Multiple View Geometry, chapter 6; OpenCV's conventions.
+//! Source: Hartley and Zisserman, Multiple View Geometry, chapter 6; `OpenCV`'s conventions.
 
 mod file;
 mod lens;

@@ -3,7 +3,7 @@
 
 mod schema;
 
-pub use schema::{Background, Config, Limits, Modbus, Odometry, Segment, View, Zone};
+pub use schema::{Background, Config, Limits, Modbus, Odometry, Segment, View};
 
 use crate::camera::{BeltView, Camera, CameraFile};
 use crate::error::{Error, Result};
@@ -40,7 +40,7 @@ impl Site {
 
     /// Check the configuration against the camera.
     pub fn new(config: Config, camera: Camera) -> Result<Self> {
-        let zone = config.zone.rect();
+        let zone = config.zone;
         check_zone_in_view(&camera, &zone)?;
         let camera_height_mm = camera.centre_in_belt().z;
         let height_max_mm = height_max(&config.view, camera_height_mm)?;

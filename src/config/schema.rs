@@ -12,8 +12,8 @@ use std::path::PathBuf;
 pub struct Config {
     /// `[camera]`
     pub camera: CameraTable,
-    /// `[zone]`
-    pub zone: Zone,
+    /// `[zone]`: the part of the belt that the camera sees freely, belt coordinates.
+    pub zone: BeltRect,
     /// `[belt]`
     pub belt: Belt,
     /// `[view]`
@@ -42,28 +42,6 @@ pub struct Config {
 pub struct CameraTable {
     /// Calibration file, relative to the configuration file.
     pub calibration: PathBuf,
-}
-
-/// `[zone]`: the part of the belt that the camera sees freely, belt coordinates.
-#[derive(Clone, Debug, Deserialize)]
-#[serde(deny_unknown_fields)]
-pub struct Zone {
-    x_min_mm: f64,
-    x_max_mm: f64,
-    y_min_mm: f64,
-    y_max_mm: f64,
-}
-
-impl Zone {
-    /// As a rectangle.
-    pub fn rect(&self) -> BeltRect {
-        BeltRect {
-            x_min_mm: self.x_min_mm,
-            x_max_mm: self.x_max_mm,
-            y_min_mm: self.y_min_mm,
-            y_max_mm: self.y_max_mm,
-        }
-    }
 }
 
 /// `[belt]`
@@ -180,7 +158,7 @@ impl Default for Limits {
 #[derive(Clone, Debug, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct Modbus {
-    /// Address and port; 502 needs CAP_NET_BIND_SERVICE.
+    /// Address and port; 502 needs `CAP_NET_BIND_SERVICE`.
     pub listen: SocketAddr,
     /// Clients at once.
     pub connections_max: usize,

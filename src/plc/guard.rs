@@ -140,10 +140,10 @@ mod tests {
 
     #[test]
     fn what_is_not_modbus_is_disconnected_without_an_answer() {
-        assert_eq!(answer(b"GET / HTTP/1.1\r\n\r\n"), []);
-        assert_eq!(answer(&[0, 1, 0, 0, 0, 0, 1]), [], "length 0");
-        assert_eq!(answer(&[0, 1, 0, 0, 0, 1, 1]), [], "no function code");
-        assert_eq!(answer(&[0, 1, 0, 0, 0xff, 0xff, 1]), [], "longer than any PDU");
-        assert_eq!(answer(&[0, 1, 0, 0, 0, 6, 1, 3]), [], "cut off");
+        assert!(answer(b"GET / HTTP/1.1\r\n\r\n").is_empty());
+        assert!(answer(&[0, 1, 0, 0, 0, 0, 1]).is_empty(), "length 0");
+        assert!(answer(&[0, 1, 0, 0, 0, 1, 1]).is_empty(), "no function code");
+        assert!(answer(&[0, 1, 0, 0, 0xff, 0xff, 1]).is_empty(), "longer than any PDU");
+        assert!(answer(&[0, 1, 0, 0, 0, 6, 1, 3]).is_empty(), "cut off");
     }
 }

@@ -118,7 +118,9 @@ impl Canvas {
     /// The frame, stretched so that its bright parts are bright.
     fn new(raw: &[u8], width: usize, height: usize) -> Self {
         let mut histogram = [0usize; 256];
-        raw.iter().for_each(|&g| histogram[usize::from(g)] += 1);
+        for &g in raw {
+            histogram[usize::from(g)] += 1;
+        }
         let mut below = 0;
         let white = histogram
             .iter()

@@ -137,27 +137,24 @@ impl Odometry {
         let assumed_px = self.speed_mm_per_s * dt_s / self.mm_per_px;
         let step_px = found.as_ref().map_or(assumed_px, |m| m.shift_px - last_px);
         let step_mm = step_px * self.mm_per_px;
-        match found {
-            Some(m) => {
-                if dt_s > 0.0 {
-                    self.speed_mm_per_s += SPEED_FOLLOW * (step_mm / dt_s - self.speed_mm_per_s);
-                }
-                self.misses = 0;
-                self.shift_px = Some(m.shift_px);
-                let far = m.shift_px.abs() > KEY_TRAVEL * self.columns.len() as f64;
-                if far || m.pairs < PAIRS_MIN * 2 {
-                    self.take_key();
-                }
+        if let Some(m) = found {
+            if dt_s > 0.0 {
+                self.speed_mm_per_s += SPEED_FOLLOW * (step_mm / dt_s - self.speed_mm_per_s);
             }
-            None => {
-                self.misses += 1;
-                self.shift_px = Some(last_px + step_px);
-                // A parcel may hide the belt for a moment: the last speed bridges that. When
-                // the texture stays away, only the nominal speed is known.
-                if self.misses >= MISSES_MAX {
-                    self.speed_mm_per_s = self.nominal_mm_per_s;
-                    self.take_key();
-                }
+            self.misses = 0;
+            self.shift_px = Some(m.shift_px);
+            let far = m.shift_px.abs() > KEY_TRAVEL * self.columns.len() as f64;
+            if far || m.pairs < PAIRS_MIN * 2 {
+                self.take_key();
+            }
+        } else {
+            self.misses += 1;
+            self.shift_px = Some(last_px + step_px);
+            // A parcel may hide the belt for a moment: the last speed bridges that. When
+            // the texture stays away, only the nominal speed is known.
+            if self.misses >= MISSES_MAX {
+                self.speed_mm_per_s = self.nominal_mm_per_s;
+                self.take_key();
             }
         }
         Motion { step_mm, measured: self.locked }

@@ -56,7 +56,7 @@ impl Rectify {
     /// The belt view.
     pub fn view(&self) -> Plane<'_> {
         let [width, height] = self.size_px;
-        Plane::packed(&self.view, width, height).expect("planned with this size") // invariant
+        Plane::packed(&self.view, width, height).unwrap_or_else(|| unreachable!("planned so"))
     }
 
     /// Bit-packed: the camera sees the pixel.

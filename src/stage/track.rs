@@ -250,7 +250,6 @@ impl Tracker {
         for (slot, track) in self.tracks.iter_mut().enumerate() {
             let travel_px = (at.travel_mm - track.first.travel_mm) / self.mm_per_px;
             match track.phase {
-                Phase::Free => {}
                 Phase::Candidate => {
                     let follows = track.followed_px() >= CONFIRM_SHARE * travel_px as f32;
                     if travel_px >= CONFIRM_TRAVEL_PX && follows && track.unseen_px == 0.0 {
@@ -265,7 +264,7 @@ impl Tracker {
                     }
                     track.phase = Phase::Free;
                 }
-                Phase::Riding | Phase::Left => {}
+                Phase::Free | Phase::Riding | Phase::Left => {}
             }
         }
     }

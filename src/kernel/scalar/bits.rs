@@ -1,7 +1,7 @@
 //! Binary morphology on bit-packed rows: pixel u of a row is bit `u % 64` of word `u / 64`.
 //!
 //! Bits beyond the width are kept 0. Outside the image counts as 0 for dilation and as 1 for
-//! erosion, so a shape at the border is not eaten from outside (OpenCV's default).
+//! erosion, so a shape at the border is not eaten from outside (`OpenCV`'s default).
 
 /// Words in a row of `width` pixels.
 pub const fn words(width: usize) -> usize {

@@ -45,7 +45,7 @@ const VARIANCE_NEW: u16 = 25 << 8;
 const VARIANCE_MIN: u16 = 370;
 /// Below this a mean cannot carry a ratio: 6 grey levels, Q8.
 const SHADOW_MEAN_MIN: u16 = 6 << 8;
-/// Complexity prior c_T of eq. 14, as a right shift: 1/32.
+/// Complexity prior `c_T` of eq. 14, as a right shift: 1/32.
 const PRUNE_SHIFT: u32 = 5;
 
 /// What a pixel shows.
@@ -166,7 +166,7 @@ fn move_mode(x: u16, mode: &mut ModeRow<'_>, i: usize, rate: u32, weight: u32) {
     let step = i64::from(((rate << 12) / weight).min(1 << 12)); // Q12
     let follow = |value: u16, target: i64| {
         let value = i64::from(value);
-        value + ((target - value) * step + (1 << 11) >> 12)
+        value + (((target - value) * step + (1 << 11)) >> 12)
     };
     let d2 = i64::from(squared(x, mode.mean[i]) >> 8);
     mode.mean[i] = follow(mode.mean[i], i64::from(x)) as u16;

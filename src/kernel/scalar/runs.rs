@@ -105,7 +105,7 @@ mod tests {
                 mask[v * words(width) + u / 64] |= 1 << (u % 64);
             }
         }
-        let mut runs = vec![Run::default(); 64];
+        let mut runs = vec![Run::default(); 1024];
         let count = collect(&mask, width, &mut runs);
         runs.truncate(count);
         (resolve(&mut runs), runs)

@@ -1,6 +1,6 @@
-//! A small deterministic generator. Source: Steele, Lea and Flood 2014 (SplitMix64).
+//! A small deterministic generator. Source: Steele, Lea and Flood 2014 (`SplitMix64`).
 
-/// SplitMix64.
+/// `SplitMix64`.
 #[derive(Clone, Debug)]
 pub struct Random(pub u64);
 

@@ -31,6 +31,8 @@ pub struct Renderer {
     tile: Vec<f32>,
     /// Surface seen by each pixel of the parcel being drawn.
     surface: Vec<u8>,
+    /// The parcels in view; room for all of them.
+    solids: Vec<Solid>,
 }
 
 /// No parcel surface.
@@ -68,6 +70,7 @@ impl Renderer {
             .collect();
         let tile = texture(scenario.seed, scenario.belt.texture_grey);
         Ok(Self {
+            solids: Vec::with_capacity(scenario.parcels().len()),
             scenario,
             centre: [centre.x as f32, centre.y as f32, centre.z as f32],
             ground,
@@ -96,7 +99,7 @@ impl Renderer {
         let blur_mm = (self.scenario.travel_mm(t_s + half_exposure_s)
             - self.scenario.travel_mm(t_s - half_exposure_s)) as f32;
         self.render_belt(travel_mm, light, frame);
-        let solids = self.solids(travel_mm);
+        let solids = self.place_solids(travel_mm);
         for solid in &solids {
             self.cast_shadow(solid, frame);
         }
@@ -104,6 +107,7 @@ impl Renderer {
             self.classify(solid);
             self.draw(solid, light, blur_mm, frame);
         }
+        self.solids = solids;
     }
 
     fn render_belt(&self, travel_mm: f64, light: f32, frame: &mut [u16]) {
@@ -142,13 +146,15 @@ impl Renderer {
         (1.0 - VIGNETTE * 1e-6 * (dx * dx + dy * dy)).max(0.2)
     }
 
-    /// The parcels in view, furthest from the nadir first: nearer ones lean over them.
-    fn solids(&self, travel_mm: f64) -> Vec<Solid> {
-        let mut solids: Vec<Solid> =
-            self.scenario.parcels().iter().filter_map(|p| self.solid(p, travel_mm)).collect();
+    /// The parcels in view, furthest from the nadir first: nearer ones lean over them. The list
+    /// is lent, so that rendering allocates nothing.
+    fn place_solids(&mut self, travel_mm: f64) -> Vec<Solid> {
+        let mut solids = std::mem::take(&mut self.solids);
+        solids.clear();
+        solids.extend(self.scenario.parcels().iter().filter_map(|p| self.solid(p, travel_mm)));
         let distance =
             |s: &Solid| (s.centre[0] - self.centre[0]).hypot(s.centre[1] - self.centre[1]);
-        solids.sort_by(|a, b| distance(b).total_cmp(&distance(a)));
+        solids.sort_unstable_by(|a, b| distance(b).total_cmp(&distance(a)));
         solids
     }
 
@@ -181,7 +187,7 @@ impl Renderer {
             clamp(bounds[2] - 2.0, height),
             clamp(bounds[3] + 3.0, height),
         ];
-        (bounds[0] < bounds[1] && bounds[2] < bounds[3]).then(|| Solid {
+        (bounds[0] < bounds[1] && bounds[2] < bounds[3]).then_some(Solid {
             parcel: *parcel,
             centre: [x_mm as f32, parcel.y_mm as f32],
             sin: sin as f32,
@@ -224,7 +230,8 @@ impl Renderer {
         let width = self.camera.image_size_px[0];
         // The outermost pixels were given a margin and show nothing.
         for v in v0 + 1..v1 - 1 {
-            for i in v * width + u0 + 1..v * width + u1 - 1 {
+            for u in u0 + 1..u1 - 1 {
+                let i = v * width + u;
                 let here = self.surface[i];
                 let plain =
                     [i - 1, i + 1, i - width, i + width].iter().all(|&n| self.surface[n] == here);
@@ -298,8 +305,8 @@ impl Solid {
             }
             leave = f32::min(leave, far);
         }
-        // NaN (a ray that misses the belt) fails the comparison.
-        if !(enter < leave) {
+        // A ray that misses the belt is NaN, and so is everything met by it.
+        if enter.partial_cmp(&leave) != Some(std::cmp::Ordering::Less) {
             return None;
         }
         let at = [0, 1].map(|k| from[k] + enter * (to[k] - from[k]));

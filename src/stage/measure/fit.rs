@@ -397,7 +397,7 @@ impl Problem<'_> {
                 let facing = outline.side_visible[edge.face()];
                 // A narrow side blurs its two edges into one place that is neither.
                 let distinct =
-                    !facing || depth_px > SIDE_DEPTH_MIN_PX || depth_px < SIDE_DEPTH_NONE_PX;
+                    !facing || !(SIDE_DEPTH_NONE_PX..=SIDE_DEPTH_MIN_PX).contains(&depth_px);
                 match (outline.visible(edge), distinct) {
                     (false, _) => 0.0,
                     (true, true) => 1.0,
