@@ -1,6 +1,7 @@
 //! What leaves the pipeline: parcel records and counters.
 
 use serde::ser::{SerializeSeq, Serializer};
+use std::fmt;
 
 /// Doubts about a record, as a set.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
@@ -48,6 +49,18 @@ impl Flags {
     /// The set as bits, as the PLC reads it.
     pub fn bits(self) -> u16 {
         self.0
+    }
+}
+
+impl fmt::Display for Flags {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        let mut names =
+            Self::NAMES.iter().filter(|(flag, _)| self.has(*flag)).map(|(_, name)| name);
+        match names.next() {
+            Some(first) => write!(f, "{first}")?,
+            None => return Ok(()),
+        }
+        names.try_for_each(|name| write!(f, ", {name}"))
     }
 }
 
@@ -108,6 +121,9 @@ pub struct ParcelRecord {
 }
 
 impl ParcelRecord {
+    /// Heads the lines that records print as.
+    pub const TABLE_HEADER: &str = "  seq  frame    t s   length  width height mm   +-     +-     +-    yaw deg     x mm    y mm  shape";
+
     /// Values rounded to what they can mean: 0.01 mm and degrees, 0.1 ms.
     #[must_use]
     pub fn rounded(mut self) -> Self {
@@ -131,6 +147,29 @@ impl ParcelRecord {
     }
 }
 
+impl fmt::Display for ParcelRecord {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        write!(
+            f,
+            "{:5} {:6} {:6.2}   {:6.1} {:6.1} {:6.1}    {:6.2} {:6.2} {:6.2}   {:7.2}   {:7.1} {:7.1}  {:?} {}",
+            self.seq,
+            self.frame,
+            self.t_s,
+            self.length_mm,
+            self.width_mm,
+            self.height_mm,
+            self.sigma_length_mm,
+            self.sigma_width_mm,
+            self.sigma_height_mm,
+            self.yaw_deg,
+            self.x_mm,
+            self.y_mm,
+            self.shape,
+            self.flags
+        )
+    }
+}
+
 /// Things that happened and must not pass unnoticed; all only grow.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub struct Counters {
@@ -148,4 +187,16 @@ pub struct Counters {
     pub track_overflows: u64,
     /// Records that found the event queue full.
     pub event_overflows: u64,
+}
+
+impl fmt::Display for Counters {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        write!(
+            f,
+            "{} frames, {} parcels reported, {} unmeasured, {} lost",
+            self.frames, self.parcels, self.unmeasured, self.lost
+        )?;
+        let overflows = self.segment_overflows + self.track_overflows + self.event_overflows;
+        if overflows > 0 { write!(f, ", {overflows} table overflows") } else { Ok(()) }
+    }
 }

@@ -2,6 +2,7 @@
 
 use beltgauge::config::Site;
 use beltgauge::error::Result;
+use beltgauge::event::ParcelRecord;
 use beltgauge::run::demo;
 use beltgauge::run::offline::{self, Outputs};
 use beltgauge::{run, source};
@@ -77,10 +78,10 @@ fn dispatch(command: Command) -> Result<()> {
         Command::Measure { input, config, fps, jsonl, annotate } => {
             let site = Site::load(&config)?;
             let outputs = Outputs { jsonl: jsonl.as_deref(), annotate: annotate.as_deref() };
-            let counters = offline::measure(source::open(&input, fps)?, site, outputs, &mut |r| {
-                println!("{r:?}");
-            })?;
-            println!("{counters:?}");
+            let source = source::open(&input, fps)?;
+            println!("{}", ParcelRecord::TABLE_HEADER);
+            let counters = offline::measure(source, site, outputs, &mut |r| println!("{r}"))?;
+            println!("{counters}");
             Ok(())
         }
         Command::Check { config } => {

@@ -10,5 +10,8 @@ fn the_committed_register_map_is_current() {
         std::fs::write(path, &current).expect("writable");
     }
     let committed = std::fs::read_to_string(path).unwrap_or_default();
-    assert!(committed == current, "config/REGISTERS.md is out of date: BLESS=1 cargo test --test registers");
+    assert!(
+        committed == current,
+        "config/REGISTERS.md is out of date: BLESS=1 cargo test --test registers"
+    );
 }

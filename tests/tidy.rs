@@ -15,13 +15,20 @@ const MAY_USE: &[(&str, &[&str])] = &[
     ("config", &["camera", "units", "error"]),
     ("kernel", &["image"]),
     ("stage", &["kernel", "camera", "config", "belt", "plan", "image", "units", "error"]),
-    ("pipeline", &["stage", "kernel", "camera", "config", "belt", "plan", "image", "event", "units", "error"]),
+    (
+        "pipeline",
+        &[
+            "stage", "kernel", "camera", "config", "belt", "plan", "image", "event", "units",
+            "error",
+        ],
+    ),
     ("source", &["camera", "image", "units", "error"]),
     ("plc", &["config", "event", "error"]),
 ];
 
 /// The only places for `unsafe`.
-const UNSAFE_ROOMS: &[&str] = &["src/kernel/avx2", "src/kernel/neon", "src/source/v4l2", "src/plan.rs"];
+const UNSAFE_ROOMS: &[&str] =
+    &["src/kernel/avx2", "src/kernel/neon", "src/source/v4l2", "src/plan.rs"];
 
 const LINES_MAX: usize = 600;
 
@@ -58,7 +65,8 @@ fn rooms_used(code: &str) -> Vec<String> {
             Some(rest) => rest.split('}').next().unwrap_or_default().to_owned(),
             None => after.to_owned(),
         };
-        let parts: Vec<&str> = if after.starts_with('{') { list.split(',').collect() } else { vec![&list] };
+        let parts: Vec<&str> =
+            if after.starts_with('{') { list.split(',').collect() } else { vec![&list] };
         for part in parts {
             let name: String =
                 part.trim().chars().take_while(|c| c.is_alphanumeric() || *c == '_').collect();
@@ -77,10 +85,9 @@ fn dependencies_point_one_way() {
         if ["run", "main", "lib"].contains(&room) {
             continue;
         }
-        let (_, allowed) = MAY_USE
-            .iter()
-            .find(|(name, _)| *name == room)
-            .unwrap_or_else(|| panic!("{room} is no room of the house: add it to MAY_USE and to lib.rs"));
+        let (_, allowed) = MAY_USE.iter().find(|(name, _)| *name == room).unwrap_or_else(|| {
+            panic!("{room} is no room of the house: add it to MAY_USE and to lib.rs")
+        });
         for used in rooms_used(&code(&text)) {
             checked += 1;
             assert!(
@@ -97,9 +104,13 @@ fn dependencies_point_one_way() {
 fn unsafe_is_only_where_it_may_be() {
     let mut rooms_with_unsafe = 0;
     for (path, text) in sources("src") {
-        let has_unsafe = code(&text).split(|c: char| !c.is_alphanumeric() && c != '_').any(|w| w == "unsafe");
+        let has_unsafe =
+            code(&text).split(|c: char| !c.is_alphanumeric() && c != '_').any(|w| w == "unsafe");
         let name = path.to_string_lossy();
-        assert!(!has_unsafe || UNSAFE_ROOMS.iter().any(|r| name.starts_with(r)), "{name} has unsafe code");
+        assert!(
+            !has_unsafe || UNSAFE_ROOMS.iter().any(|r| name.starts_with(r)),
+            "{name} has unsafe code"
+        );
         rooms_with_unsafe += usize::from(has_unsafe);
     }
     assert!(rooms_with_unsafe > 0, "plan.rs has unsafe code: the check no longer sees it");
@@ -126,7 +137,11 @@ fn files_fit_in_the_head() {
     for folder in ["src", "tests", "hil"] {
         for (path, text) in sources(folder) {
             let lines = text.lines().count();
-            assert!(lines <= LINES_MAX, "{} has {lines} lines: what is it really two of?", path.display());
+            assert!(
+                lines <= LINES_MAX,
+                "{} has {lines} lines: what is it really two of?",
+                path.display()
+            );
         }
     }
 }

@@ -78,11 +78,6 @@ pub fn draw(
         canvas.line(base[k], top[k], SIDE);
         canvas.line(top[k], top[(k + 1) % 4], TOP);
     }
-    let flags: Vec<_> = crate::event::Flags::NAMES
-        .iter()
-        .filter(|(f, _)| record.flags.has(*f))
-        .map(|(_, n)| *n)
-        .collect();
     let text = format!(
         "#{} {:?}\nL {:.1} +- {:.1} mm\nW {:.1} +- {:.1} mm\nH {:.1} +- {:.1} mm\n{}",
         record.seq,
@@ -93,7 +88,7 @@ pub fn draw(
         record.sigma_width_mm,
         record.height_mm,
         record.sigma_height_mm,
-        flags.join(" ")
+        record.flags
     );
     let seen = || base.iter().chain(&top).flatten();
     let right = seen().map(|p| p.x).max().unwrap_or(0) + 10;

@@ -129,7 +129,7 @@ fn table(scenario: &Scenario, records: &[ParcelRecord], progress: &Progress) -> 
         let measured = [r.length_mm, r.width_mm, r.height_mm];
         let sigma = [r.sigma_length_mm, r.sigma_width_mm, r.sigma_height_mm];
         let triple = |v: [f64; 3]| format!("{:6.1} {:6.1} {:6.1}", v[0], v[1], v[2]);
-        let flags = serde_json::to_string(&r.flags).unwrap_or_default();
+        let flags = r.flags;
         let Some(parcel) = truth(scenario, r) else {
             let _ = writeln!(
                 text,

@@ -1,0 +1,56 @@
+//! What several tests share: the command, scratch folders and the shared data.
+#![allow(dead_code)] // each test uses its part
+
+use std::path::{Path, PathBuf};
+use std::process::{Command, Output};
+
+/// The product's binary.
+pub fn beltgauge() -> Command {
+    Command::new(env!("CARGO_BIN_EXE_beltgauge"))
+}
+
+/// Run a command to its end.
+pub fn run(command: &mut Command) -> Output {
+    command.output().expect("the program starts")
+}
+
+/// A new, empty folder for a test.
+pub fn scratch(name: &str) -> PathBuf {
+    let folder = Path::new(env!("CARGO_TARGET_TMPDIR")).join(name);
+    let _ = std::fs::remove_dir_all(&folder);
+    std::fs::create_dir_all(&folder).expect("writable");
+    folder
+}
+
+/// Data with ground truth that lies beside a developer's clone, not in it.
+///
+/// `None`, and a note, when it is not there; with CI=true that is a failure.
+pub fn shared_data(part: &str) -> Option<PathBuf> {
+    let path = Path::new(env!("CARGO_MANIFEST_DIR")).join("../shared").join(part);
+    if path.exists() {
+        return Some(path);
+    }
+    assert!(std::env::var("CI").as_deref() != Ok("true"), "no {} although CI=true", path.display());
+    eprintln!("skipped: no data ({})", path.display());
+    None
+}
+
+/// A camera straight above a belt, and a configuration for it, written into `folder`.
+pub fn write_site(folder: &Path, image_size_px: [usize; 2]) -> PathBuf {
+    let [width, height] = image_size_px;
+    let camera = format!(
+        "image_size_px = [{width}, {height}]\n\
+         [lens]\nmodel = \"brown\"\nfx_px = 500\nfy_px = 500\ncx_px = {}\ncy_px = {}\n\
+         distortion = [0, 0, 0, 0, 0]\n\
+         [pose]\nrotation = [[1, 0, 0], [0, -1, 0], [0, 0, -1]]\ntranslation_mm = [0, 0, 1500]\n",
+        width / 2,
+        height / 2
+    );
+    std::fs::write(folder.join("camera.toml"), camera).expect("writable");
+    let config = "[camera]\ncalibration = \"camera.toml\"\n\
+                  [zone]\nx_min_mm = -300\nx_max_mm = 300\ny_min_mm = -200\ny_max_mm = 200\n\
+                  [belt]\nspeed_mm_per_s = 500\n";
+    let path = folder.join("beltgauge.toml");
+    std::fs::write(&path, config).expect("writable");
+    path
+}
