@@ -86,8 +86,9 @@ fn dispatch(command: Command) -> Result<()> {
         }
         Command::Check { config } => {
             let site = Site::load(&config)?;
-            println!("{}", run::plan(&site));
-            Ok(())
+            let plan = run::plan(&site);
+            println!("{plan}");
+            plan.check_limit(site.config.limits.memory_mib_max)
         }
     }
 }

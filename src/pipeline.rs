@@ -345,7 +345,7 @@ impl Pipeline {
             shape,
             flags,
         };
-        record.flags.set(Flags::MERGED, track.ever_merged);
+        record.flags.set(Flags::MERGED, track.was_merged());
         record.flags.set(Flags::CLIPPED, reference.clipped);
         record.flags.set(Flags::HEIGHT_UNCERTAIN, record.sigma_height_mm > HEIGHT_SIGMA_MAX_MM);
         record.flags.set(Flags::SPEED_ASSUMED, travel_sigma > SPEED_SIGMA_MAX);

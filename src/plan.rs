@@ -57,21 +57,27 @@ impl Plan {
         self.entries.iter().map(|e| e.bytes().next_multiple_of(ALIGN)).sum()
     }
 
+    /// Refuse a plan beyond `mib_max`.
+    pub fn check_limit(&self, mib_max: usize) -> Result<()> {
+        if self.bytes() <= mib_max << 20 {
+            return Ok(());
+        }
+        let largest = self.entries.iter().max_by_key(|e| e.bytes());
+        Err(Error::configuration(format!(
+            "the memory plan needs {:.1} MiB, limits.memory_mib_max = {mib_max}",
+            mib(self.bytes())
+        ))
+        .allowed(format!("limits.memory_mib_max of at least {}", mib(self.bytes()).ceil()))
+        .remedy(format!(
+            "raise it, or choose a coarser view.mm_per_px, a smaller zone or a lower \
+             view.height_max_mm; the largest buffer is {}",
+            largest.map_or("none", |e| e.name)
+        )))
+    }
+
     /// Map the memory; refuses a plan beyond `mib_max`.
     pub fn reserve(self, mib_max: usize) -> Result<Memory> {
-        if self.bytes() > mib_max << 20 {
-            let largest = self.entries.iter().max_by_key(|e| e.bytes());
-            return Err(Error::configuration(format!(
-                "the memory plan needs {:.1} MiB, limits.memory_mib_max = {mib_max}",
-                mib(self.bytes())
-            ))
-            .allowed(format!("limits.memory_mib_max of at least {}", mib(self.bytes()).ceil()))
-            .remedy(format!(
-                "raise it, or choose a coarser view.mm_per_px, a smaller zone or a lower \
-                 view.height_max_mm; the largest buffer is {}",
-                largest.map_or("none", |e| e.name)
-            )));
-        }
+        self.check_limit(mib_max)?;
         let mapping = memmap2::MmapMut::map_anon(self.bytes().max(1))
             .map_err(|e| Error::failure(format!("cannot map {} bytes: {e}", self.bytes())))?;
         Ok(Memory { plan: self, mapping: Arc::new(Mapping(mapping)), next: 0, offset: 0 })

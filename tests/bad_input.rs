@@ -93,6 +93,7 @@ fn a_zone_turned_inside_out_is_refused() {
 fn a_memory_limit_that_is_too_small_names_the_largest_buffer() {
     let limits = "[limits]\nmemory_mib_max = 1\n[belt]";
     let config = site_with("memory", "[belt]", limits);
+    refused(&["check".as_ref(), "--config".as_ref(), &config], 2, &["memory_mib_max = 1"]);
     let y4m = config.with_file_name("one.y4m");
     write_y4m(&y4m, 1);
     refused(

@@ -25,6 +25,8 @@ const YOUNG_FRAMES: u32 = 8;
 
 /// A smaller track inside a larger one's blob for this many frames is a piece of it.
 const FRAGMENT_FRAMES: u32 = 8;
+/// Fewer shared frames than this do not harm a pass.
+const MERGED_FRAMES: u32 = 3;
 /// Inside means this share of its box.
 const INSIDE_SHARE: f32 = 0.8;
 
@@ -57,8 +59,8 @@ pub struct Track {
     pub frames: u32,
     /// It shares its blob with another track in this frame.
     pub merged: bool,
-    /// It did so in any frame.
-    pub ever_merged: bool,
+    /// Frames in which it did, other than with pieces of itself.
+    merged_frames: u32,
     /// Frames on end that it has been inside a larger track's blob.
     inside_frames: u32,
     /// Travel, px, since it was last seen.
@@ -72,7 +74,7 @@ const FREE: Track = Track {
     first: BeltPosition { travel_mm: 0.0, measured_mm: 0.0 },
     frames: 0,
     merged: false,
-    ever_merged: false,
+    merged_frames: 0,
     inside_frames: 0,
     unseen_px: 0.0,
     first_bounds: PxBox { u0: 0.0, u1: 0.0, v0: 0.0, v1: 0.0 },
@@ -82,6 +84,11 @@ impl Track {
     /// Whether the track holds the background under it.
     pub fn is_parcel(&self) -> bool {
         matches!(self.phase, Phase::Riding | Phase::Left)
+    }
+
+    /// Whether it ran together with another parcel for long enough to matter.
+    pub fn was_merged(&self) -> bool {
+        self.merged_frames >= MERGED_FRAMES
     }
 
     /// How far the blob's ends have moved, px: the better of both, as one end may be clipped.
@@ -195,7 +202,9 @@ impl Tracker {
             track.inside_frames = if inside { track.inside_frames + 1 } else { 0 };
             let young = track.frames < YOUNG_FRAMES && track.phase == Phase::Candidate;
             if young || track.inside_frames >= FRAGMENT_FRAMES {
-                track.phase = Phase::Free; // a piece rejoined
+                // A piece rejoined: what looked like two parcels was one.
+                track.phase = Phase::Free;
+                self.tracks[owner].merged_frames = 0;
             } else {
                 track.merged = true;
                 shared |= !inside;
@@ -217,7 +226,7 @@ impl Tracker {
                 .filter(|b| self.owners[b.label as usize] == s as u16)
                 .fold(PxBox::default(), |all, b| all.union(&b.bounds));
             if track.merged {
-                track.ever_merged = true;
+                track.merged_frames += 1;
                 track.unseen_px = 0.0;
             } else if seen.u0.is_finite() {
                 track.bounds = seen;
