@@ -12,7 +12,7 @@ impl Flags {
     pub const UNFINISHED: Self = Self(1 << 0);
     /// Its image ran together with a neighbour's for some of the pass.
     pub const MERGED: Self = Self(1 << 1);
-    /// It reached out of what the camera sees of the zone.
+    /// It reached over the side of the zone; parts outside are not used.
     pub const CLIPPED: Self = Self(1 << 2);
     /// The height's standard deviation is above 3 mm.
     pub const HEIGHT_UNCERTAIN: Self = Self(1 << 3);

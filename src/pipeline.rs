@@ -44,7 +44,6 @@ struct Reference {
     at: BeltPosition,
     /// It has passed; before that it is just the newest frame.
     fixed: bool,
-    clipped: bool,
 }
 
 /// The pipeline.
@@ -90,13 +89,8 @@ impl Pipeline {
         let (zone, view, config) = (site.config.zone, &site.view, &site.config);
         let magnification_max = view.magnification(site.height_max_mm);
         let start = FrameTime { index: 0, t_s: 0.0 };
-        let nowhere = Reference {
-            began_s: 0.0,
-            time: start,
-            at: BeltPosition::default(),
-            fixed: false,
-            clipped: false,
-        };
+        let nowhere =
+            Reference { began_s: 0.0, time: start, at: BeltPosition::default(), fixed: false };
         let rectify = Rectify::new(&site.camera, view, memory)?;
         let background = Background::new(view.size_px, config.background.clone(), memory)?;
         let odometry = Odometry::new(
@@ -235,13 +229,8 @@ impl Pipeline {
         for &(slot, change) in self.tracker.changes() {
             if change == Change::Began {
                 self.measure.begin(slot, self.at);
-                self.references[slot] = Reference {
-                    began_s: time.t_s,
-                    time,
-                    at: self.at,
-                    fixed: false,
-                    clipped: false,
-                };
+                self.references[slot] =
+                    Reference { began_s: time.t_s, time, at: self.at, fixed: false };
             }
         }
         let frame = Frame {
@@ -346,11 +335,18 @@ impl Pipeline {
             flags,
         };
         record.flags.set(Flags::MERGED, track.was_merged());
-        record.flags.set(Flags::CLIPPED, reference.clipped);
+        record.flags.set(Flags::CLIPPED, self.reaches_out(p));
         record.flags.set(Flags::HEIGHT_UNCERTAIN, record.sigma_height_mm > HEIGHT_SIGMA_MAX_MM);
         record.flags.set(Flags::SPEED_ASSUMED, travel_sigma > SPEED_SIGMA_MAX);
         record.flags.set(Flags::SILHOUETTE_ONLY, fit.edge_count == 0);
         record.rounded()
+    }
+
+    /// Whether a cuboid reaches over the side of the zone, where nothing of it is used.
+    fn reaches_out(&self, params: &measure::Params) -> bool {
+        let outline = measure::Outline::new(&self.site.view, params, 0.0);
+        let zone = &self.zone;
+        outline.base.iter().any(|v| !(zone.y_min_mm..=zone.y_max_mm).contains(&v.over_belt.y))
     }
 
     /// Frames at which a parcel, by slot, passed the middle of the zone: where its record holds.

@@ -1,0 +1,216 @@
+//! Recordings with ground truth that the project did not render: see `common::shared_data`.
+
+mod common;
+
+use common::{beltgauge, scratch, shared_data};
+use serde_json::Value;
+use std::path::{Path, PathBuf};
+use std::process::{Command, Stdio};
+
+/// A parcel record or a truth entry.
+type Json = Value;
+
+fn number(value: &Json, key: &str) -> f64 {
+    value[key].as_f64().unwrap_or_else(|| panic!("no number {key} in {value}"))
+}
+
+fn load(path: &Path) -> Json {
+    serde_json::from_str(&std::fs::read_to_string(path).expect("readable")).expect("JSON")
+}
+
+fn vector(value: &Json) -> [f64; 3] {
+    let flat = |v: &Json| v.as_f64().or_else(|| v[0].as_f64()).expect("a number");
+    std::array::from_fn(|i| flat(&value[i]))
+}
+
+fn camera_centre(truth: &Json) -> [f64; 3] {
+    let rows: [[f64; 3]; 3] = std::array::from_fn(|i| vector(&truth["R_world_to_camera"][i]));
+    let t = vector(&truth["t_world_to_camera_mm"]);
+    std::array::from_fn(|i| -(0..3).map(|k| rows[k][i] * t[k]).sum::<f64>())
+}
+
+/// camera.toml with the true calibration, the origin under the camera as `calibrate` puts it,
+/// and a configuration with a nominal speed.
+fn write_site(folder: &Path, truth: &Json, nominal_mm_per_s: f64) -> PathBuf {
+    let centre = camera_centre(truth);
+    let t = vector(&truth["t_world_to_camera_mm"]);
+    let shifted: [f64; 3] = std::array::from_fn(|i| {
+        let row = vector(&truth["R_world_to_camera"][i]);
+        t[i] + row[0] * centre[0] + row[1] * centre[1]
+    });
+    let k = &truth["camera_matrix"];
+    let camera = format!(
+        "image_size_px = {}\n[lens]\nmodel = \"brown\"\nfx_px = {}\nfy_px = {}\ncx_px = {}\ncy_px = {}\n\
+         distortion = {}\n[pose]\nrotation = {}\ntranslation_mm = {shifted:?}\n",
+        truth["image_size"],
+        k[0][0],
+        k[1][1],
+        k[0][2],
+        k[1][2],
+        truth["dist_coeffs_k1_k2_p1_p2_k3"],
+        truth["R_world_to_camera"],
+    );
+    std::fs::write(folder.join("camera.toml"), camera).expect("writable");
+    let config = format!(
+        "[camera]\ncalibration = \"camera.toml\"\n\
+         [zone]\nx_min_mm = -600\nx_max_mm = 600\ny_min_mm = -380\ny_max_mm = 380\n\
+         [belt]\nspeed_mm_per_s = {nominal_mm_per_s}\n"
+    );
+    let path = folder.join("beltgauge.toml");
+    std::fs::write(&path, config).expect("writable");
+    path
+}
+
+/// Measure a video through ffmpeg and a pipe, as a user does.
+fn measure_video(video: &Path, config: &Path, folder: &Path) -> Vec<Json> {
+    let mut ffmpeg = Command::new("ffmpeg")
+        .args(["-v", "error", "-i"])
+        .arg(video)
+        .args(["-pix_fmt", "gray", "-f", "yuv4mpegpipe", "-strict", "-1", "-"])
+        .stdout(Stdio::piped())
+        .spawn()
+        .expect("ffmpeg is installed");
+    let jsonl = folder.join("parcels.jsonl");
+    let status = beltgauge()
+        .args(["measure", "-", "--config"])
+        .arg(config)
+        .arg("--jsonl")
+        .arg(&jsonl)
+        .stdin(ffmpeg.stdout.take().expect("piped"))
+        .status()
+        .expect("starts");
+    assert!(status.success() && ffmpeg.wait().expect("ends").success());
+    records(&jsonl)
+}
+
+fn records(jsonl: &Path) -> Vec<Json> {
+    let text = std::fs::read_to_string(jsonl).expect("written");
+    text.lines().map(|line| serde_json::from_str(line).expect("JSON")).collect()
+}
+
+struct Score {
+    missed: Vec<Json>,
+    unmatched: Vec<Json>,
+    /// Absolute errors of L, W and H of the cuboids, mm.
+    cuboid_errors_mm: Vec<f64>,
+}
+
+impl Score {
+    fn mean_mm(&self) -> f64 {
+        self.cuboid_errors_mm.iter().sum::<f64>() / self.cuboid_errors_mm.len() as f64
+    }
+}
+
+/// Match records to the truth by place and time; a parcel is matched once. Expected is what
+/// leaves a zone that ends at 600 mm at least 5 frames before the end.
+fn score(truth: &Json, records: &[Json]) -> Score {
+    let centre = camera_centre(truth);
+    let travel: Vec<f64> = truth["belt_displacement_mm"]
+        .as_array()
+        .expect("a list")
+        .iter()
+        .map(|d| d.as_f64().expect("a number"))
+        .collect();
+    let parcels = truth["parcels"].as_array().expect("a list");
+    let place = |p: &Json, frame: usize| {
+        let at = &p["centre_at_zero_displacement_mm"];
+        let (x, y) = (at[0].as_f64().expect("x"), at[1].as_f64().expect("y"));
+        (x + travel[frame.min(travel.len() - 1)] - centre[0], y - centre[1])
+    };
+    let mut used = vec![false; parcels.len()];
+    let mut result =
+        Score { missed: Vec::new(), unmatched: Vec::new(), cuboid_errors_mm: Vec::new() };
+    for record in records {
+        let distance = |i: usize| {
+            let (x, y) = place(&parcels[i], number(record, "frame") as usize);
+            (number(record, "x_mm") - x).hypot(number(record, "y_mm") - y)
+        };
+        let nearest = (0..parcels.len()).min_by(|&a, &b| distance(a).total_cmp(&distance(b)));
+        let Some(i) = nearest.filter(|&i| distance(i) < 80.0 && !used[i]) else {
+            result.unmatched.push(record.clone());
+            continue;
+        };
+        used[i] = true;
+        if parcels[i]["kind"] == "cuboid" {
+            for key in ["length_mm", "width_mm", "height_mm"] {
+                let error_mm = number(record, key) - number(&parcels[i], key);
+                eprintln!("{:>4} {key:10} {error_mm:+.2}", parcels[i]["id"]);
+                result.cuboid_errors_mm.push(error_mm.abs());
+            }
+        }
+    }
+    let last = travel.len() - 6;
+    for (i, p) in parcels.iter().enumerate().filter(|(i, _)| !used[*i]) {
+        let (sin, cos) = number(p, "yaw_deg").to_radians().sin_cos();
+        let half = (number(p, "length_mm") * cos.abs() + number(p, "width_mm") * sin.abs()) / 2.0;
+        if place(p, last).0 - half > 600.0 {
+            result.missed.push(parcels[i].clone());
+        }
+    }
+    result
+}
+
+/// Measure a rendered sequence with the nominal speed 2 % wrong.
+fn rendered(name: &str) -> Option<Score> {
+    let data = shared_data(&format!("data/rendered/{name}"))?;
+    let truth = load(&data.join("truth.json"));
+    let folder = scratch(name);
+    let config = write_site(&folder, &truth, 1.02 * number(&truth, "belt_speed_mm_s"));
+    let found = measure_video(&data.join(format!("{name}.mkv")), &config, &folder);
+    Some(score(&truth, &found))
+}
+
+// What is promised at this stage is 5 mm; what is reached, with a path tracer's rounded edges
+// (0.3 mm a side) and compressed video, is 1.0 to 1.4 mm. The gate keeps what is reached.
+const MEAN_MM: f64 = 2.0;
+
+#[test]
+fn public_a_all_found_once_none_false() {
+    let Some(score) = rendered("public_a") else { return };
+    assert!(
+        score.missed.is_empty() && score.unmatched.is_empty(),
+        "{:?} {:?}",
+        score.missed,
+        score.unmatched
+    );
+    assert!(score.mean_mm() < MEAN_MM, "mean error {:.2} mm", score.mean_mm());
+}
+
+#[test]
+fn public_b_all_cuboids_found_on_a_tilted_camera_in_drifting_light() {
+    let Some(score) = rendered("public_b") else { return };
+    assert!(
+        score.missed.is_empty() && score.unmatched.is_empty(),
+        "{:?} {:?}",
+        score.missed,
+        score.unmatched
+    );
+    assert!(score.mean_mm() < MEAN_MM, "mean error {:.2} mm", score.mean_mm());
+}
+
+#[test]
+fn real_belt_one_box_from_a_steeply_oblique_camera() {
+    let Some(data) = shared_data("data/real_belt") else { return };
+    let folder = scratch("real_belt");
+    let jsonl = folder.join("parcels.jsonl");
+    let status = beltgauge()
+        .arg("measure")
+        .arg(data.join("frames_left"))
+        .args(["--fps", "15.066", "--config"])
+        .arg(data.join("beltgauge.toml"))
+        .arg("--jsonl")
+        .arg(&jsonl)
+        .arg("--annotate")
+        .arg(&folder)
+        .status()
+        .expect("starts");
+    assert!(status.success());
+    let found = records(&jsonl);
+    assert_eq!(found.len(), 1, "{found:?}");
+    // Roughly 11 x 11 x 8 cm, by eye; the true size is not known here.
+    for (key, about_mm) in [("length_mm", 110.0), ("width_mm", 110.0), ("height_mm", 80.0)] {
+        assert!((number(&found[0], key) - about_mm).abs() < 15.0, "{:?}", found[0]);
+    }
+    assert_eq!(found[0]["shape"], "box");
+    assert!(folder.join("parcel_0001.png").exists());
+}
