@@ -161,7 +161,7 @@ fn missing_files_are_named() {
 /// `frames` grey frames as Y4M.
 fn write_y4m(path: &Path, frames: usize) {
     let mut file = fs::File::create(path).expect("writable");
-    write!(file, "YUV4MPEG2 W{} H{} F30:1 Ip Cmono\n", SIZE[0], SIZE[1]).expect("written");
+    writeln!(file, "YUV4MPEG2 W{} H{} F30:1 Ip Cmono", SIZE[0], SIZE[1]).expect("written");
     for _ in 0..frames {
         file.write_all(b"FRAME\n").expect("written");
         file.write_all(&vec![90; SIZE[0] * SIZE[1]]).expect("written");

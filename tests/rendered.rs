@@ -142,7 +142,8 @@ fn score(truth: &Json, records: &[Json]) -> Score {
     let last = travel.len() - 6;
     for (i, p) in parcels.iter().enumerate().filter(|(i, _)| !used[*i]) {
         let (sin, cos) = number(p, "yaw_deg").to_radians().sin_cos();
-        let half = (number(p, "length_mm") * cos.abs() + number(p, "width_mm") * sin.abs()) / 2.0;
+        let half =
+            0.5 * number(p, "length_mm") * cos.abs() + 0.5 * number(p, "width_mm") * sin.abs();
         if place(p, last).0 - half > 600.0 {
             result.missed.push(parcels[i].clone());
         }

@@ -215,7 +215,7 @@ fn a_truncated_recording_keeps_what_was_measured_before() {
         y4m.extend(&frame);
     }
     let jsonl = folder.join("parcels.jsonl");
-    let mut measure = |bytes: &[u8]| {
+    let measure = |bytes: &[u8]| {
         let mut child = common::beltgauge()
             .args(["measure", "-", "--config"])
             .arg(folder.join("beltgauge.toml"))

@@ -1,0 +1,36 @@
+//! The demo as a user starts it, on one processor.
+
+use hil::{Demo, wait_for};
+
+/// What the appliance may need, by its promise.
+const PEAK_MIB_MAX: f64 = 100.0;
+
+#[test]
+fn the_demo_fits_one_processor_and_a_hundred_megabytes() {
+    let seconds = 20;
+    let demo = Demo::start("demo", seconds, true);
+    let (mut peak_mib, mut ticks) = (0.0f64, 0);
+    wait_for("the end of the demo", || {
+        let (Some(mib), Some(used)) = (demo.peak_mib(), demo.processor_ticks()) else {
+            return Some(());
+        };
+        (peak_mib, ticks) = (peak_mib.max(mib), ticks.max(used));
+        demo.out.join("table.txt").exists().then_some(())
+    });
+    let table = std::fs::read_to_string(demo.out.join("table.txt")).expect("written");
+    let out = demo.out.clone();
+    let records = demo.records();
+    // Printed, not judged: build machines are noisy.
+    eprintln!(
+        "{table}peak {peak_mib:.1} MiB, {:.0} % of one processor",
+        ticks as f64 / f64::from(seconds)
+    );
+    assert!(peak_mib > 10.0 && peak_mib < PEAK_MIB_MAX, "peak {peak_mib:.1} MiB");
+    assert!(records.len() >= 5, "{} parcels in {seconds} s", records.len());
+    assert!(!table.contains("belongs to no parcel"), "{table}");
+    for record in &records {
+        let picture =
+            out.join(format!("parcel_{:04}.png", record["seq"].as_u64().expect("a number")));
+        assert!(picture.exists(), "{}", picture.display());
+    }
+}
