@@ -7,7 +7,7 @@ use std::net::SocketAddr;
 use std::path::PathBuf;
 
 /// The configuration file.
-#[derive(Clone, Debug, Deserialize)]
+#[derive(Clone, Debug, PartialEq, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct Config {
     /// `[camera]`
@@ -37,7 +37,7 @@ pub struct Config {
 }
 
 /// `[camera]`: where the pictures come from and how they were taken.
-#[derive(Clone, Debug, Deserialize)]
+#[derive(Clone, Debug, PartialEq, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct CameraTable {
     /// Calibration file, relative to the configuration file.
@@ -45,7 +45,7 @@ pub struct CameraTable {
 }
 
 /// `[belt]`
-#[derive(Clone, Debug, Deserialize)]
+#[derive(Clone, Debug, PartialEq, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct Belt {
     /// Nominal speed; may be off by 5 %.
@@ -53,7 +53,7 @@ pub struct Belt {
 }
 
 /// `[view]`: the rectified belt view.
-#[derive(Clone, Debug, Default, Deserialize)]
+#[derive(Clone, Debug, Default, PartialEq, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct View {
     /// Pixel size on the belt; default: the camera's own in the middle of the zone.
@@ -63,7 +63,7 @@ pub struct View {
 }
 
 /// `[background]`: the Gaussian mixture model.
-#[derive(Clone, Debug, Deserialize)]
+#[derive(Clone, Debug, PartialEq, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct Background {
     /// Frames at start-up on which the empty belt is learned and no parcel is reported.
@@ -92,7 +92,7 @@ impl Default for Background {
 }
 
 /// `[segment]`: from mask to blobs.
-#[derive(Clone, Debug, Deserialize)]
+#[derive(Clone, Debug, PartialEq, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct Segment {
     /// Specks narrower than this vanish (opening).
@@ -110,7 +110,7 @@ impl Default for Segment {
 }
 
 /// `[odometry]`: belt motion from the belt's own texture.
-#[derive(Clone, Debug, Deserialize)]
+#[derive(Clone, Debug, PartialEq, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct Odometry {
     /// Largest relative error of the nominal speed that is searched.
@@ -124,7 +124,7 @@ impl Default for Odometry {
 }
 
 /// `[limits]`: the size of every table.
-#[derive(Clone, Debug, Deserialize)]
+#[derive(Clone, Debug, PartialEq, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct Limits {
     /// The memory plan may not need more.
@@ -155,7 +155,7 @@ impl Default for Limits {
 }
 
 /// `[modbus]`: the server for the PLC.
-#[derive(Clone, Debug, Deserialize)]
+#[derive(Clone, Debug, PartialEq, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct Modbus {
     /// Address and port; 502 needs `CAP_NET_BIND_SERVICE`.
