@@ -220,3 +220,148 @@ impl Measure {
         Some(edges.filter(|e| e.edge_count >= EDGE_COUNT_MIN).unwrap_or(reach))
     }
 }
+
+#[cfg(test)]
+mod tests {
+    use super::fit::{Estimate, Problem, Silhouette, canonical_estimate};
+    use super::*;
+    use crate::units::BeltMm;
+    use nalgebra::Vector2;
+
+    const ZONE: BeltRect =
+        BeltRect { x_min_mm: -600.0, x_max_mm: 600.0, y_min_mm: -400.0, y_max_mm: 400.0 };
+
+    fn geometry() -> BeltView {
+        BeltView {
+            size_px: [1000, 600],
+            mm_per_px: 1.5,
+            origin: BeltMm { x: -750.0, y: 450.0 },
+            nadir: Vector2::new(0.0, 0.0),
+            camera_height_mm: 1500.0,
+        }
+    }
+
+    /// Views of a pass of `truth` over the zone, X at the middle of the pass.
+    fn pass(truth: &Params, distort: impl Fn(usize) -> f32) -> Vec<View> {
+        let travels = (-20..=20).map(|i| f64::from(i) * 25.0);
+        travels
+            .enumerate()
+            .map(|(n, travel)| {
+                View::of(&Outline::new(&geometry(), truth, travel), travel, |i| distort(n * 64 + i))
+            })
+            .collect()
+    }
+
+    fn fit(views: &[View], travel_sigma: f64) -> Option<Estimate> {
+        let geometry = geometry();
+        let problem = Problem {
+            geometry: &geometry,
+            zone: &ZONE,
+            height_max_mm: 400.0,
+            reference_travel_mm: 0.0,
+            travel_sigma,
+            silhouette: Silhouette::Whole,
+        };
+        let reach = problem.fit_reach(views, None)?;
+        problem.fit_edges(views, reach.params).map(canonical_estimate)
+    }
+
+    fn assert_near(estimate: &Estimate, truth: &Params, tolerance_mm: f64) {
+        let truth = model::canonical(*truth);
+        for i in [X, Y, LENGTH, WIDTH, HEIGHT] {
+            let error = estimate.params[i] - truth[i];
+            assert!(error.abs() < tolerance_mm, "parameter {i}: {error:+.3} mm, {estimate:?}");
+        }
+    }
+
+    /// Deterministic noise with a standard deviation of about 0.5.
+    fn noise(i: usize) -> f32 {
+        let bits = (i as u32).wrapping_mul(2_654_435_761) >> 8;
+        (bits as f32 / (1 << 24) as f32 - 0.5) * 1.7
+    }
+
+    fn cuboid(y: f64, yaw_deg: f64, [l, w, h]: [f64; 3]) -> Params {
+        Params::from([0.0, y, yaw_deg.to_radians(), l, w, h, 1.0])
+    }
+
+    // The only errors of a perfect pass are f32 storage (1e-4 mm) and the prior on the height.
+    const EXACT_MM: f64 = 0.05;
+
+    #[test]
+    fn a_perfect_pass_is_fitted_exactly() {
+        for yaw_deg in [-80.0, -35.0, 10.0, 45.0, 60.0] {
+            let truth = cuboid(120.0, yaw_deg, [235.0, 125.0, 70.0]);
+            let estimate = fit(&pass(&truth, |_| 0.0), 3e-4).expect("fits");
+            assert_near(&estimate, &truth, EXACT_MM);
+        }
+    }
+
+    #[test]
+    fn noise_of_half_a_mm_leaves_tenths_and_the_sigma_says_so() {
+        let truth = cuboid(-150.0, 25.0, [330.0, 105.0, 140.0]);
+        let estimate = fit(&pass(&truth, noise), 3e-4).expect("fits");
+        assert_near(&estimate, &truth, 0.3);
+        assert!((0.3..1.5).contains(&estimate.sigma[HEIGHT]), "{estimate:?}");
+    }
+
+    #[test]
+    fn a_wrong_belt_speed_is_found_from_base_and_top_edges() {
+        let truth = cuboid(200.0, 30.0, [300.0, 200.0, 150.0]);
+        let mut fast = truth;
+        fast[SCALE] = 1.03;
+        // The prior knows nothing better than 3 %.
+        let estimate = fit(&pass(&fast, |_| 0.0), 0.03).expect("fits");
+        assert!((estimate.params[SCALE] - 1.03).abs() < 0.002, "{estimate:?}");
+        assert_near(&estimate, &fast, 3.0);
+    }
+
+    #[test]
+    fn parallel_to_the_belt_is_no_special_case() {
+        for yaw_deg in [0.0, 90.0] {
+            let truth = cuboid(100.0, yaw_deg, [200.0, 150.0, 90.0]);
+            assert_near(&fit(&pass(&truth, |_| 0.0), 3e-4).expect("fits"), &truth, EXACT_MM);
+        }
+    }
+
+    #[test]
+    fn a_square_footprint_has_some_yaw_and_the_right_size() {
+        let truth = cuboid(100.0, 30.0, [60.0, 60.0, 15.0]);
+        let estimate = fit(&pass(&truth, |_| 0.0), 3e-4).expect("fits");
+        assert!((estimate.params[LENGTH] - 60.0).abs() < EXACT_MM);
+        assert!((estimate.params[WIDTH] - 60.0).abs() < EXACT_MM);
+    }
+
+    #[test]
+    fn an_envelope_is_measured() {
+        let truth = cuboid(-190.0, -18.0, [240.0, 160.0, 4.0]);
+        assert_near(&fit(&pass(&truth, |_| 0.0), 3e-4).expect("fits"), &truth, 0.2);
+    }
+
+    #[test]
+    fn a_pass_right_under_the_camera_is_measured() {
+        let truth = cuboid(0.0, 20.0, [200.0, 100.0, 50.0]);
+        assert_near(&fit(&pass(&truth, |_| 0.0), 3e-4).expect("fits"), &truth, EXACT_MM);
+    }
+
+    #[test]
+    fn a_quarter_of_wild_edges_does_no_harm() {
+        let truth = cuboid(150.0, 40.0, [250.0, 150.0, 100.0]);
+        let wild = |i: usize| if i.is_multiple_of(4) { 30.0 * noise(i) } else { 0.3 * noise(i) };
+        assert_near(&fit(&pass(&truth, wild), 3e-4).expect("fits"), &truth, 0.5);
+    }
+
+    #[test]
+    fn no_views_or_views_that_show_nothing_give_no_estimate() {
+        assert!(fit(&[], 3e-4).is_none());
+        assert!(fit(&[View::EMPTY; 5], 3e-4).is_none());
+    }
+
+    #[test]
+    fn a_single_view_gives_no_false_certainty() {
+        let truth = cuboid(150.0, 40.0, [250.0, 150.0, 100.0]);
+        let one = &pass(&truth, |_| 0.0)[20..21];
+        if let Some(estimate) = fit(one, 3e-4) {
+            assert!(estimate.sigma[HEIGHT] > 3.0, "{estimate:?}");
+        }
+    }
+}

@@ -226,3 +226,38 @@ impl Frame<'_> {
         })
     }
 }
+
+#[cfg(test)]
+impl View {
+    /// What a perfect camera sees of a cuboid; `distort` moves each step, mm, by sample index.
+    pub(super) fn of(
+        outline: &Outline,
+        travel_mm: f64,
+        mut distort: impl FnMut(usize) -> f32,
+    ) -> Self {
+        let mut view = Self { travel_mm, ..Self::EMPTY };
+        let reach =
+            std::array::from_fn(|k| outline.support(direction(k)).image.dot(&direction(k)) as f32);
+        view.reach_mm = [reach; 2];
+        let mut count = 0;
+        for edge in (0..EDGES as u8).map(EdgeId).filter(|&e| outline.visible(e)) {
+            let [a, b] = outline.ends(edge);
+            let outward = outline.normals[edge.face()];
+            for i in 0..SAMPLES_PER_EDGE {
+                let t = (i as f64 + 0.5) / SAMPLES_PER_EDGE as f64;
+                let anchor = a.image + (b.image - a.image) * t;
+                let mut sample = EdgeSample {
+                    edge,
+                    anchor: [anchor.x as f32, anchor.y as f32],
+                    outward: [outward.x as f32, outward.y as f32],
+                    ..NO_SAMPLE
+                };
+                sample.steps[0] = Step { at: distort(count), slope: -20.0 };
+                view.samples[count] = sample;
+                count += 1;
+            }
+        }
+        view.sample_count = count as u8;
+        view
+    }
+}
