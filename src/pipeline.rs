@@ -367,6 +367,11 @@ impl Pipeline {
         self.background.learned()
     }
 
+    /// Where the belt is.
+    pub fn belt_position(&self) -> BeltPosition {
+        self.at
+    }
+
     /// The belt's motion in the last frame, and whether it was measured.
     pub fn belt_motion(&self) -> (f64, bool) {
         self.odometry.speed()

@@ -189,6 +189,44 @@ fn a_parcel_still_inside_at_the_end_is_unfinished() {
 }
 
 #[test]
+fn the_belt_is_its_own_odometer() {
+    // Half a second of standstill in the middle; the nominal speed 5 % wrong.
+    let stop = "[[belt.stop]]\nat_s = 3.0\nfor_s = 0.5\nramp_s = 0.2\n";
+    let scenario = scenario(180, 500.0, stop);
+    let mut source = Synthetic::new(scenario.clone()).expect("renders");
+    let (mut frames, mut pipeline) = run::build(site(&scenario, 525.0)).expect("fits");
+    let mut frame = frames.pop().expect("planned");
+    let mut start = None;
+    while let Some(time) = source.next_into(&mut frame).expect("renders") {
+        let raw = Plane::packed(&frame, 1280, 800).expect("this size");
+        pipeline.step(raw, time, &mut |_| {}).expect("this size");
+        // The first frames are learned and then assumed at the nominal speed.
+        if time.index == 20 {
+            start = Some((pipeline.belt_position(), scenario.travel_at_frame_mm(20)));
+        }
+    }
+    let (from, true_from_mm) = start.expect("passed");
+    let to = pipeline.belt_position();
+    let travel_mm = to.travel_mm - from.travel_mm;
+    let true_mm = scenario.travel_at_frame_mm(179) - true_from_mm;
+    // 0.03 % is what heights need.
+    assert!((travel_mm / true_mm - 1.0).abs() < 3e-4, "{travel_mm:.2} of {true_mm:.2} mm");
+    let assumed_mm = travel_mm - (to.measured_mm - from.measured_mm);
+    assert!(assumed_mm.abs() < 1e-6, "{assumed_mm} mm were not measured");
+}
+
+#[test]
+fn a_belt_without_texture_says_that_its_speed_is_assumed() {
+    let mut scenario =
+        scenario(150, 500.0, &parcel([235.0, 125.0, 70.0], 12.0, [-900.0, -100.0], "kraft"));
+    scenario.belt.texture_grey = 0.0;
+    let pairs = matched(&scenario, &measure(&scenario, 500.0));
+    assert!(pairs[0].1.flags.has(Flags::SPEED_ASSUMED), "{:?}", pairs[0].1);
+    // The footprint hardly depends on the speed; the height does, and says so.
+    assert!(pairs[0].1.sigma_height_mm > 3.0, "{:?}", pairs[0].1);
+}
+
+#[test]
 fn the_same_frames_give_the_same_records() {
     let scenario =
         scenario(120, 500.0, &parcel([200.0, 150.0, 90.0], 50.0, [-900.0, 0.0], "white"));

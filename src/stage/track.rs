@@ -298,3 +298,152 @@ impl Tracker {
         self.tracks[slot].phase = Phase::Left;
     }
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    const TRACKS: usize = 3;
+    /// Belt travel a frame; a pixel is a millimetre.
+    const STEP_MM: f64 = 10.0;
+
+    struct Belt {
+        tracker: Tracker,
+        at: BeltPosition,
+    }
+
+    impl Belt {
+        fn new() -> Self {
+            let mut plan = Plan::default();
+            Tracker::plan(TRACKS, 16, &mut plan);
+            let mut memory = plan.reserve(1).expect("small");
+            let tracker = Tracker::new(1.0, 1.2, &mut memory).expect("planned");
+            Self { tracker, at: BeltPosition::default() }
+        }
+
+        /// One frame with boxes (u0, u1, v0, v1).
+        fn frame(&mut self, step_mm: f64, boxes: &[[f32; 4]]) {
+            self.at.advance(step_mm, true);
+            let blobs: Vec<Blob> = boxes
+                .iter()
+                .enumerate()
+                .map(|(label, &[u0, u1, v0, v1])| Blob {
+                    label: label as u32,
+                    bounds: PxBox { u0, u1, v0, v1 },
+                    ..Blob::default()
+                })
+                .collect();
+            self.tracker.step(&blobs, step_mm, self.at, &|_, _| false);
+        }
+
+        fn phases(&self) -> [Phase; TRACKS] {
+            std::array::from_fn(|s| self.tracker.tracks()[s].phase)
+        }
+    }
+
+    fn at(u: f32, v: f32) -> [f32; 4] {
+        [u, u + 60.0, v, v + 40.0]
+    }
+
+    #[test]
+    fn what_rides_on_the_belt_becomes_a_parcel() {
+        let mut belt = Belt::new();
+        for i in 0..5u8 {
+            belt.frame(STEP_MM, &[at(f32::from(i) * 10.0, 0.0)]);
+        }
+        assert_eq!(belt.phases(), [Phase::Riding, Phase::Free, Phase::Free]);
+    }
+
+    #[test]
+    fn what_stands_still_on_a_moving_belt_never_does() {
+        let mut belt = Belt::new();
+        for _ in 0..100 {
+            belt.frame(STEP_MM, &[at(50.0, 0.0)]);
+            assert!(belt.tracker.tracks().iter().all(|t| !t.is_parcel()));
+        }
+    }
+
+    #[test]
+    fn a_belt_stop_changes_nothing() {
+        let mut belt = Belt::new();
+        for i in 0..5u8 {
+            belt.frame(STEP_MM, &[at(f32::from(i) * 10.0, 0.0)]);
+        }
+        for _ in 0..1000 {
+            belt.frame(0.0, &[at(40.0, 0.0)]);
+        }
+        belt.frame(STEP_MM, &[at(50.0, 0.0)]);
+        assert_eq!(belt.phases(), [Phase::Riding, Phase::Free, Phase::Free]);
+        assert!(belt.tracker.changes().is_empty());
+    }
+
+    #[test]
+    fn a_parcel_unseen_for_a_moment_is_carried_on_and_found_again() {
+        let mut belt = Belt::new();
+        for i in 0..5u8 {
+            belt.frame(STEP_MM, &[at(f32::from(i) * 10.0, 0.0)]);
+        }
+        for _ in 0..5 {
+            belt.frame(STEP_MM, &[]);
+        }
+        belt.frame(STEP_MM, &[at(100.0, 0.0)]);
+        assert_eq!(belt.phases(), [Phase::Riding, Phase::Free, Phase::Free]);
+        assert_eq!(belt.tracker.owners()[0], 0);
+    }
+
+    #[test]
+    fn a_parcel_that_vanishes_is_lost_once() {
+        let mut belt = Belt::new();
+        for i in 0..5u8 {
+            belt.frame(STEP_MM, &[at(f32::from(i) * 10.0, 0.0)]);
+        }
+        let mut lost = 0;
+        for _ in 0..30 {
+            belt.frame(STEP_MM, &[]);
+            lost += belt.tracker.changes().iter().filter(|c| c.1 == Change::Lost).count();
+        }
+        assert_eq!((lost, belt.phases()), (1, [Phase::Free; TRACKS]));
+    }
+
+    #[test]
+    fn two_parcels_whose_images_run_together_stay_two() {
+        let mut belt = Belt::new();
+        for i in 0..10u8 {
+            let u = f32::from(i) * 10.0;
+            belt.frame(STEP_MM, &[at(u, 0.0), at(u, 60.0)]);
+        }
+        for i in 10..14u8 {
+            let u = f32::from(i) * 10.0;
+            belt.frame(STEP_MM, &[[u, u + 60.0, 0.0, 100.0]]);
+        }
+        belt.frame(STEP_MM, &[at(140.0, 0.0), at(140.0, 60.0)]);
+        assert_eq!(belt.phases(), [Phase::Riding, Phase::Riding, Phase::Free]);
+        assert!(belt.tracker.tracks()[..2].iter().any(Track::was_merged));
+    }
+
+    #[test]
+    fn a_piece_of_a_parcel_rejoins_it() {
+        let mut belt = Belt::new();
+        for i in 0..12u8 {
+            let u = f32::from(i) * 10.0;
+            belt.frame(STEP_MM, &[at(u, 0.0), [u + 62.0, u + 70.0, 0.0, 40.0]]);
+        }
+        assert_eq!(belt.phases(), [Phase::Riding, Phase::Riding, Phase::Free]);
+        for i in 12..30u8 {
+            let u = f32::from(i) * 10.0;
+            belt.frame(STEP_MM, &[[u, u + 70.0, 0.0, 40.0]]);
+        }
+        assert_eq!(belt.phases().iter().filter(|p| **p == Phase::Riding).count(), 1);
+    }
+
+    #[test]
+    fn a_full_table_is_counted() {
+        let mut belt = Belt::new();
+        for i in 0..5u8 {
+            let u = f32::from(i) * 10.0;
+            belt.frame(STEP_MM, &[at(u, 0.0), at(u, 100.0), at(u, 200.0), at(u, 300.0)]);
+        }
+        assert_eq!(belt.phases(), [Phase::Riding; TRACKS]);
+        assert_eq!(belt.tracker.overflows, 5);
+    }
+}

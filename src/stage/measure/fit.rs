@@ -36,6 +36,8 @@ const VOTE_SHARE: f64 = 0.85;
 const SIDE_DEPTH_MIN_PX: f64 = 4.0;
 /// A side narrower than this does not disturb its top edge.
 const SIDE_DEPTH_NONE_PX: f64 = 0.3;
+/// Contact shadows pull base edges outward by a pixel or two: they count this much.
+const BASE_TRUST: f64 = 0.2;
 /// In between, a top edge counts this much: enough when there is nothing better.
 const NARROW_SIDE_TRUST: f64 = 0.05;
 /// Profiles on neighbouring places and frames share their errors; this many count as one.
@@ -97,6 +99,7 @@ struct FaceVote {
 }
 
 /// Sums of a least squares problem.
+#[derive(Clone)]
 struct Normal {
     matrix: SMatrix<f64, N, N>,
     vector: SVector<f64, N>,
@@ -151,7 +154,7 @@ impl Problem<'_> {
             }
         }
         let (_, params) = best?;
-        let (normal, reach_error) = self.reach_normal(views, &params, REACH_SIGMA_MM);
+        let (normal, reach_error) = self.reach_normal(views, &params);
         self.estimate(params, &normal, reach_error, &EdgeUse::default())
     }
 
@@ -185,20 +188,18 @@ impl Problem<'_> {
         let mut polarity = [0.0; EDGES];
         let mut last = None;
         for gate_px in GATES_PX {
-            let (mut normal, reach_error) = self.reach_normal(views, &params, REACH_GUARD_SIGMA_MM);
-            let used = self.add_edges(
-                views,
-                &params,
-                gate_px * self.geometry.mm_per_px,
-                &polarity,
-                &mut normal,
-            );
+            let gate_mm = gate_px * self.geometry.mm_per_px;
+            let mut edges = self.priors(&params);
+            let used = self.add_edges(views, &params, gate_mm, &polarity, &mut edges);
+            let mut guarded = edges.clone();
+            let reach_error = self.add_reach(views, &params, REACH_GUARD_SIGMA_MM, &mut guarded);
             if gate_px <= POLARITY_GATE_PX {
                 polarity = used.polarity;
             }
-            params = self.bounded(params, params + normal.solve(1e-6)?);
-            last = Some((normal, reach_error, used));
+            params = self.bounded(params, params + guarded.solve(1e-6)?);
+            last = Some((edges, reach_error, used));
         }
+        // Silhouettes are biased by shadows: they guide, but make nothing more certain.
         let (normal, reach_error, used) = last?;
         self.estimate(params, &normal, reach_error, &used)
     }
@@ -320,11 +321,11 @@ impl Problem<'_> {
     /// Levenberg-Marquardt on the silhouettes.
     fn descend(&self, views: &[View], start: Params, iterations: usize) -> (f64, Params) {
         let (mut params, mut damping) = (start, 1e-3);
-        let (mut normal, _) = self.reach_normal(views, &params, REACH_SIGMA_MM);
+        let (mut normal, _) = self.reach_normal(views, &params);
         for _ in 0..iterations {
             let Some(step) = normal.solve(damping) else { break };
             let next = self.bounded(params, params + step);
-            let (next_normal, _) = self.reach_normal(views, &next, REACH_SIGMA_MM);
+            let (next_normal, _) = self.reach_normal(views, &next);
             if next_normal.cost < normal.cost {
                 (params, normal, damping) = (next, next_normal, damping * 0.2);
             } else {
@@ -346,18 +347,42 @@ impl Problem<'_> {
         to
     }
 
-    /// Silhouette residuals (Huber) and the priors. Also the mean square residual.
-    fn reach_normal(&self, views: &[View], params: &Params, sigma_mm: f64) -> (Normal, f64) {
+    /// What is known before anything is seen.
+    fn priors(&self, params: &Params) -> Normal {
         let mut normal = Normal::new();
+        let axis = |i: usize| SVector::<f64, N>::ith(i, 1.0);
+        normal.add(1.0 - params[SCALE], &axis(SCALE), self.travel_sigma.powi(-2));
+        // Keeps the height determined while the baseline is still short.
+        let middle = 0.25 * self.height_max_mm;
+        normal.add(middle - params[HEIGHT], &axis(HEIGHT), (4.0 * middle).powi(-2));
+        // Next to nothing, so that what no edge shows is uncertain instead of singular.
+        for i in [X, Y, YAW, LENGTH, WIDTH] {
+            normal.add(0.0, &axis(i), 1e-5);
+        }
+        normal
+    }
+
+    /// Priors and silhouettes.
+    fn reach_normal(&self, views: &[View], params: &Params) -> (Normal, f64) {
+        let mut normal = self.priors(params);
+        let mean_square = self.add_reach(views, params, REACH_SIGMA_MM, &mut normal);
+        (normal, mean_square)
+    }
+
+    /// Silhouette residuals (Huber). Returns their mean square, in units of the blobs' sigma.
+    fn add_reach(
+        &self,
+        views: &[View],
+        params: &Params,
+        sigma_mm: f64,
+        normal: &mut Normal,
+    ) -> f64 {
         let (mut squares, mut count) = (0.0, 0);
         for view in views {
             let outline =
                 Outline::new(self.geometry, params, view.travel_mm - self.reference_travel_mm);
-            for (k, &reach) in view.reach_mm[self.silhouette as usize]
-                .iter()
-                .enumerate()
-                .filter(|(_, r)| r.is_finite())
-            {
+            let reach = &view.reach_mm[self.silhouette as usize];
+            for (k, &reach) in reach.iter().enumerate().filter(|(_, r)| r.is_finite()) {
                 let d = direction(k);
                 let vertex = outline.support(d);
                 let residual = f64::from(reach) - vertex.image.dot(&d);
@@ -368,13 +393,7 @@ impl Problem<'_> {
                 count += 1;
             }
         }
-        let axis = |i: usize| SVector::<f64, N>::ith(i, 1.0);
-        normal.add(1.0 - params[SCALE], &axis(SCALE), self.travel_sigma.powi(-2));
-        // Keeps the height determined while the baseline is still short.
-        let middle = 0.25 * self.height_max_mm;
-        normal.add(middle - params[HEIGHT], &axis(HEIGHT), (4.0 * middle).powi(-2));
-        let mean_square = squares / f64::from(count.max(1)) / (REACH_SIGMA_MM * REACH_SIGMA_MM);
-        (normal, mean_square)
+        squares / f64::from(count.max(1)) / (REACH_SIGMA_MM * REACH_SIGMA_MM)
     }
 
     /// Edge residuals (biweight) with the step that each profile offers within the gate.
@@ -396,13 +415,12 @@ impl Problem<'_> {
                 let depth_px = outline.side_depth_mm(edge.face()) / self.geometry.mm_per_px;
                 let facing = outline.side_visible[edge.face()];
                 // A narrow side blurs its two edges into one place that is neither.
-                let distinct =
-                    !facing || !(SIDE_DEPTH_NONE_PX..=SIDE_DEPTH_MIN_PX).contains(&depth_px);
-                match (outline.visible(edge), distinct) {
-                    (false, _) => 0.0,
-                    (true, true) => 1.0,
-                    (true, false) if edge.is_base() => 0.0,
-                    (true, false) => NARROW_SIDE_TRUST,
+                let wide = depth_px > SIDE_DEPTH_MIN_PX;
+                match (edge.is_base(), facing) {
+                    (true, true) if wide => BASE_TRUST,
+                    (true, _) => 0.0,
+                    (false, true) if !wide && depth_px > SIDE_DEPTH_NONE_PX => NARROW_SIDE_TRUST,
+                    (false, _) => 1.0,
                 }
             });
             for sample in view.samples() {
@@ -419,9 +437,13 @@ impl Problem<'_> {
                 used.squares += residual * residual;
                 used.polarity[e] += f64::from(slope.signum());
                 let share = residual / gate_mm;
-                let biweight = trust[e] * (1.0 - share * share).powi(2);
+                let biweight = (1.0 - share * share).powi(2);
                 used.contrast += biweight * f64::from(slope.abs().min(VOTE_SLOPE_MAX));
-                normal.add(residual, &row, biweight / (CORRELATED_SAMPLES * sigma_mm * sigma_mm));
+                normal.add(
+                    residual,
+                    &row,
+                    trust[e] * biweight / (CORRELATED_SAMPLES * sigma_mm * sigma_mm),
+                );
             }
         }
         used
