@@ -4,12 +4,15 @@ use beltgauge::config::Site;
 use beltgauge::error::Result;
 use beltgauge::event::ParcelRecord;
 use beltgauge::run::demo;
-use beltgauge::run::offline::{self, Outputs};
+use beltgauge::run::offline::{self, Observer, Outputs};
 use beltgauge::{run, source};
 use clap::{Parser, Subcommand};
+use std::io::IsTerminal;
 use std::net::SocketAddr;
 use std::path::PathBuf;
 use std::process::ExitCode;
+use tracing::Level;
+use tracing_subscriber::EnvFilter;
 
 /// Measures parcels on a conveyor with one fixed camera.
 #[derive(Parser)]
@@ -59,12 +62,33 @@ enum Command {
 }
 
 fn main() -> ExitCode {
+    // Logs go beside the results, on standard error: RUST_LOG=beltgauge=debug shows more.
+    let filter = EnvFilter::builder().with_default_directive(Level::WARN.into()).from_env_lossy();
+    tracing_subscriber::fmt().with_env_filter(filter).with_writer(std::io::stderr).init();
     match dispatch(Cli::parse().command) {
         Ok(()) => ExitCode::SUCCESS,
         Err(error) => {
             eprintln!("error: {error}");
             ExitCode::from(error.exit_status())
         }
+    }
+}
+
+/// Records on standard output, progress on a terminal's standard error.
+struct Console;
+
+impl Observer for Console {
+    fn frame(&mut self, index: u64) {
+        if index.is_multiple_of(20) && std::io::stderr().is_terminal() {
+            eprint!("\rframe {index} ");
+        }
+    }
+
+    fn record(&mut self, record: &ParcelRecord) {
+        if std::io::stderr().is_terminal() {
+            eprint!("\r");
+        }
+        println!("{record}");
     }
 }
 
@@ -80,7 +104,7 @@ fn dispatch(command: Command) -> Result<()> {
             let outputs = Outputs { jsonl: jsonl.as_deref(), annotate: annotate.as_deref() };
             let source = source::open(&input, fps)?;
             println!("{}", ParcelRecord::TABLE_HEADER);
-            let counters = offline::measure(source, site, outputs, &mut |r| println!("{r}"))?;
+            let counters = offline::measure(source, site, outputs, &mut Console)?;
             println!("{counters}");
             Ok(())
         }

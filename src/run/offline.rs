@@ -18,13 +18,21 @@ pub struct Outputs<'a> {
     pub annotate: Option<&'a Path>,
 }
 
+/// Who watches a replay.
+pub trait Observer {
+    /// A frame is about to be processed.
+    fn frame(&mut self, _index: u64) {}
+    /// A parcel was measured.
+    fn record(&mut self, record: &ParcelRecord);
+}
+
 /// Measure a replay. After a broken input what was measured until there is written, with the
 /// parcels still inside flagged unfinished, and the error returned.
 pub fn measure(
     mut source: Box<dyn FrameSource>,
     site: Site,
     outputs: Outputs<'_>,
-    on_record: &mut dyn FnMut(&ParcelRecord),
+    observer: &mut dyn Observer,
 ) -> Result<Counters> {
     let [width, height] = source.size_px();
     let expected = site.camera.image_size_px;
@@ -48,6 +56,7 @@ pub fn measure(
         let ended = match next {
             Ok(Some(time)) => {
                 last_index = time.index;
+                observer.frame(time.index);
                 let raw = Plane::packed(&frame, width, height)
                     .ok_or_else(|| Error::failure("a frame of another size"))?;
                 pipeline.step(raw, time, &mut |r| records.push(r))?;
@@ -63,7 +72,7 @@ pub fn measure(
             if let Some(lines) = &mut lines {
                 lines.write(record)?;
             }
-            on_record(record);
+            observer.record(record);
         }
         if let Some(annotator) = &mut annotator {
             annotator.frame(&frame, last_index, &pipeline, &records)?;

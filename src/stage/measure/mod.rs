@@ -353,7 +353,7 @@ mod tests {
     #[test]
     fn no_views_or_views_that_show_nothing_give_no_estimate() {
         assert!(fit(&[], 3e-4).is_none());
-        assert!(fit(&[View::EMPTY; 5], 3e-4).is_none());
+        assert!(fit(&vec![View::EMPTY; 5], 3e-4).is_none());
     }
 
     #[test]
