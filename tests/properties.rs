@@ -97,10 +97,9 @@ proptest! {
              [zone]\nx_min_mm = {x_min}\nx_max_mm = {}\ny_min_mm = {y_min}\ny_max_mm = {}\n\
              [belt]\nspeed_mm_per_s = 500\n", x_min + length, y_min + width,
         );
-        if let Ok(config) = Config::parse(&text) {
-            if let Ok(site) = Site::new(config, camera(height_mm, tilt_deg, 0.0, -0.1)) {
-                prop_assert!(site.view.size_px.iter().all(|&n| (1..=8192).contains(&n)));
-            }
+        let camera = camera(height_mm, tilt_deg, 0.0, -0.1);
+        if let Ok(site) = Config::parse(&text).and_then(|config| Site::new(config, camera)) {
+            prop_assert!(site.view.size_px.iter().all(|&n| (1..=8192).contains(&n)));
         }
     }
 }

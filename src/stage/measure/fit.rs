@@ -6,9 +6,10 @@
 //! Source: Nocedal and Wright, chapter 10; Huber 1964 and Tukey's biweight for outliers.
 
 use super::model::{
-    EDGES, EdgeId, HEIGHT, LENGTH, N, Outline, Params, SCALE, WIDTH, X, Y, YAW, canonical,
+    DIRECTIONS, EDGES, EdgeId, HEIGHT, LENGTH, N, Outline, Params, SCALE, WIDTH, X, Y, YAW,
+    canonical, direction,
 };
-use super::observe::{DIRECTIONS, EdgeSample, View, direction};
+use super::observe::{EdgeSample, View};
 use crate::camera::BeltView;
 use crate::units::BeltRect;
 use nalgebra::{SMatrix, SVector, Vector2};

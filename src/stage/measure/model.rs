@@ -3,7 +3,6 @@
 //! Source: DESIGN "known motion". A point at height h over the belt point q appears at
 //! `nadir + m (q - nadir)` with `m = Zc / (Zc - h)`, in mm on the belt plane.
 
-use super::observe::{DIRECTIONS, direction};
 use crate::camera::BeltView;
 use nalgebra::{SMatrix, SVector, Vector2};
 
@@ -26,6 +25,15 @@ pub const SCALE: usize = 6;
 
 /// Cuboid and motion: [X, Y, YAW, LENGTH, WIDTH, HEIGHT, SCALE].
 pub type Params = SVector<f64, N>;
+
+/// Directions in which the reach of a silhouette is kept, evenly around the circle.
+pub const DIRECTIONS: usize = 32;
+
+/// Unit vector of direction `k`.
+pub fn direction(k: usize) -> Vector2<f64> {
+    let angle = std::f64::consts::TAU * k as f64 / DIRECTIONS as f64;
+    Vector2::new(angle.cos(), angle.sin())
+}
 
 /// Corners of the footprint in units of half length and half width, counter-clockwise.
 /// Face k lies between corner k and corner k + 1.

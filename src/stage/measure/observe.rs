@@ -1,6 +1,6 @@
 //! What one frame tells about one parcel: how far its blob reaches, and where edges are.
 
-use super::model::{EDGES, EdgeId, Outline};
+use super::model::{DIRECTIONS, EDGES, EdgeId, Outline, direction};
 use crate::camera::BeltView;
 use crate::image::Plane;
 use crate::kernel::scalar::bits::words;
@@ -9,8 +9,6 @@ use crate::kernel::scalar::runs::Run;
 use crate::units::{BeltMm, BeltPx, BeltRect};
 use nalgebra::Vector2;
 
-/// Directions in which the reach of a blob is kept, evenly around the circle.
-pub const DIRECTIONS: usize = 32;
 /// Places on each edge where a profile is taken.
 pub const SAMPLES_PER_EDGE: usize = 8;
 /// Steps kept of one profile.
@@ -21,12 +19,6 @@ const SEARCH_PX: usize = 24;
 const PROFILE_HALF_WIDTH: i32 = 1;
 /// Weaker steps than this, grey levels a px, drown in sensor noise.
 const SLOPE_MIN: f32 = 0.8;
-
-/// Unit vector of direction `k`.
-pub fn direction(k: usize) -> Vector2<f64> {
-    let angle = std::f64::consts::TAU * k as f64 / DIRECTIONS as f64;
-    Vector2::new(angle.cos(), angle.sin())
-}
 
 /// A profile across a predicted edge.
 #[derive(Clone, Copy, Debug)]
