@@ -8,7 +8,7 @@ pub type Result<T> = std::result::Result<T, Error>;
 
 /// Whose turn it is to act, and so the exit status.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub enum ErrorKind {
+enum ErrorKind {
     /// The command line, a configuration or a calibration is wrong: exit status 2.
     Configuration,
     /// Input, device or system failed while working: exit status 1.
@@ -71,11 +71,6 @@ impl Error {
     pub fn remedy(mut self, remedy: impl Into<String>) -> Self {
         self.0.remedy = remedy.into();
         self
-    }
-
-    /// Configuration or failure.
-    pub fn kind(&self) -> ErrorKind {
-        self.0.kind
     }
 
     /// The process exit status that the command line promises.

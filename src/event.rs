@@ -20,11 +20,15 @@ impl Flags {
     pub const SPEED_ASSUMED: Self = Self(1 << 4);
     /// It vanished inside the zone.
     pub const LOST: Self = Self(1 << 5);
+    /// Taller than `view.height_max_mm`: nothing of it can be trusted.
+    pub const TOO_TALL: Self = Self(1 << 7);
+    /// The standard deviation of length or width is above 3 mm.
+    pub const FOOTPRINT_UNCERTAIN: Self = Self(1 << 8);
     /// Too few edges were found: size from the silhouette alone.
     pub const SILHOUETTE_ONLY: Self = Self(1 << 6);
 
     /// Every flag with its name in records, in bit order.
-    pub const NAMES: [(Self, &'static str); 7] = [
+    pub const NAMES: [(Self, &'static str); 9] = [
         (Self::UNFINISHED, "unfinished"),
         (Self::MERGED, "merged"),
         (Self::CLIPPED, "clipped"),
@@ -32,6 +36,8 @@ impl Flags {
         (Self::SPEED_ASSUMED, "speed_assumed"),
         (Self::LOST, "lost"),
         (Self::SILHOUETTE_ONLY, "silhouette_only"),
+        (Self::TOO_TALL, "too_tall"),
+        (Self::FOOTPRINT_UNCERTAIN, "footprint_uncertain"),
     ];
 
     /// Add `flag` when `condition` holds.
@@ -142,6 +148,10 @@ impl ParcelRecord {
             &mut self.belt_speed_mm_per_s,
         ] {
             round(value, 100.0);
+        }
+        // Rounding may reach the open end of (-90, 90].
+        if self.yaw_deg <= -90.0 {
+            self.yaw_deg += 180.0;
         }
         self
     }

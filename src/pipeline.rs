@@ -9,21 +9,21 @@ use crate::config::Site;
 use crate::error::{Error, Result};
 use crate::event::{Counters, Flags, ParcelRecord, Shape};
 use crate::image::{FrameTime, Plane};
-use crate::kernel::scalar::bits::{dilate3x3, words};
+use crate::kernel::scalar::bits::{self, dilate3x3, words};
 use crate::plan::{Block, Memory, Plan};
 use crate::stage::background::Background;
 use crate::stage::measure::{self, Estimate, Frame, Measure};
 use crate::stage::odometry::Odometry;
 use crate::stage::rectify::Rectify;
-use crate::stage::segment::{Blob, Segment};
+use crate::stage::segment::{PxBox, Segment};
 use crate::stage::track::{Change, NOBODY, Phase, Track, Tracker};
 use crate::units::{BeltPx, BeltRect};
 use nalgebra::Vector2;
 
 /// Below this share of profiles with an edge where the cuboid has one, it is no cuboid.
 const BOX_EDGE_SHARE_MIN: f64 = 0.5;
-/// Above this sigma a height is flagged.
-const HEIGHT_SIGMA_MAX_MM: f64 = 3.0;
+/// Above this sigma a dimension is flagged.
+const SIGMA_MAX_MM: f64 = 3.0;
 /// Above this relative sigma the belt speed counts as assumed.
 const SPEED_SIGMA_MAX: f64 = 0.01;
 /// Around a parcel this many px are not learned as background: the next frame's parcel.
@@ -135,7 +135,8 @@ impl Pipeline {
         time: FrameTime,
         emit: &mut dyn FnMut(ParcelRecord),
     ) -> Result<()> {
-        self.check_size(raw, time)?;
+        let at_frame = |e: Error| e.at(format!("frame {}", time.index));
+        self.site.check_image_size([raw.width(), raw.height()]).map_err(at_frame)?;
         let dt_s = self.last.map_or(0.0, |last| time.t_s - last.t_s);
         self.last = Some(time);
         self.counters.frames += 1;
@@ -168,17 +169,6 @@ impl Pipeline {
         }
     }
 
-    fn check_size(&self, raw: Plane<'_>, time: FrameTime) -> Result<()> {
-        let [width, height] = self.site.camera.image_size_px;
-        if [raw.width(), raw.height()] == [width, height] {
-            return Ok(());
-        }
-        Err(Error::failure(format!("a frame of {} x {} px", raw.width(), raw.height()))
-            .at(format!("frame {}", time.index))
-            .allowed(format!("{width} x {height} px, the calibration's image_size_px"))
-            .remedy("use the calibration of this camera and image size"))
-    }
-
     /// Not to be learned: parcels, or the whole belt at a standstill, when its texture and
     /// whatever stands on it would become background.
     fn hold_background(&mut self) {
@@ -193,7 +183,7 @@ impl Pipeline {
             let owner = self.tracker.owners().get(run.label as usize).copied().unwrap_or(NOBODY);
             let held = self.tracker.tracks().get(usize::from(owner)).is_some_and(Track::is_parcel);
             if held {
-                set_bits(&mut self.hold[usize::from(run.v) * n..][..n], run.start, run.end);
+                bits::set(&mut self.hold[usize::from(run.v) * n..][..n], run.start, run.end);
             }
         }
         widen(&mut self.hold, &mut self.scratch, width, HOLD_MARGIN_PX);
@@ -213,16 +203,15 @@ impl Pipeline {
     /// cuts the shadow beyond it off) is part of that parcel.
     fn track(&mut self, step_mm: f64) {
         let Self { tracker, segment, measure, site, at, .. } = self;
-        let belongs = |slot: usize, blob: &Blob| {
-            let b = blob.bounds;
+        let covers = |slot: usize, b: &PxBox| {
             let centre =
                 BeltPx { u: f64::from(b.u0 + b.u1) / 2.0, v: f64::from(b.v0 + b.v1) / 2.0 };
             let centre = site.view.belt_point(centre);
             let margin_mm = PIECE_MARGIN_PX * site.view.mm_per_px;
             let outline = measure.outline(slot, *at);
-            outline.is_some_and(|o| o.covers(Vector2::new(centre.x, centre.y), margin_mm))
+            outline.map(|o| o.covers(Vector2::new(centre.x, centre.y), margin_mm))
         };
-        tracker.step(segment.blobs(), step_mm, *at, &belongs);
+        tracker.step(segment.blobs(), step_mm, *at, &covers);
     }
 
     fn measure_tracks(&mut self, time: FrameTime) {
@@ -336,8 +325,11 @@ impl Pipeline {
         };
         record.flags.set(Flags::MERGED, track.was_merged());
         record.flags.set(Flags::CLIPPED, self.reaches_out(p));
-        record.flags.set(Flags::HEIGHT_UNCERTAIN, record.sigma_height_mm > HEIGHT_SIGMA_MAX_MM);
+        record.flags.set(Flags::HEIGHT_UNCERTAIN, record.sigma_height_mm > SIGMA_MAX_MM);
+        let footprint_sigma_mm = record.sigma_length_mm.max(record.sigma_width_mm);
+        record.flags.set(Flags::FOOTPRINT_UNCERTAIN, footprint_sigma_mm > SIGMA_MAX_MM);
         record.flags.set(Flags::SPEED_ASSUMED, travel_sigma > SPEED_SIGMA_MAX);
+        record.flags.set(Flags::TOO_TALL, record.height_mm > self.site.height_max_mm);
         record.flags.set(Flags::SILHOUETTE_ONLY, fit.edge_count == 0);
         record.rounded()
     }
@@ -388,12 +380,5 @@ fn widen(mask: &mut Block<u64>, scratch: &mut Block<u64>, width: usize, times: u
     for _ in 0..times {
         dilate3x3(mask, scratch, width);
         std::mem::swap(mask, scratch);
-    }
-}
-
-/// Set bits `start..end` of a row.
-fn set_bits(row: &mut [u64], start: u16, end: u16) {
-    for u in usize::from(start)..usize::from(end) {
-        row[u / 64] |= 1 << (u % 64);
     }
 }

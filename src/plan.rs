@@ -80,7 +80,7 @@ impl Plan {
         self.check_limit(mib_max)?;
         let mapping = memmap2::MmapMut::map_anon(self.bytes().max(1))
             .map_err(|e| Error::failure(format!("cannot map {} bytes: {e}", self.bytes())))?;
-        Ok(Memory { plan: self, mapping: Arc::new(Mapping(mapping)), next: 0, offset: 0 })
+        Ok(Memory { plan: self, mapping: Arc::new(Mapping(mapping.into())), next: 0, offset: 0 })
     }
 }
 
@@ -118,7 +118,7 @@ impl fmt::Display for Plan {
     }
 }
 
-struct Mapping(memmap2::MmapMut);
+struct Mapping(memmap2::MmapRaw);
 
 /// The mapping while stages take their blocks, in the order of the plan.
 pub struct Memory {
@@ -157,7 +157,7 @@ impl Memory {
         // SAFETY: plan order and next_multiple_of(ALIGN) give every entry its own range, inside
         // the mapping, which holds the sum of them all; page-aligned base and 64-byte
         // offsets satisfy T's alignment (checked above). The Arc keeps the mapping alive.
-        let start = unsafe { self.mapping.0.as_ptr().cast_mut().add(self.offset).cast::<T>() };
+        let start = unsafe { self.mapping.0.as_mut_ptr().add(self.offset).cast::<T>() };
         for i in 0..count {
             // SAFETY: i < count elements of T lie inside this entry's range.
             unsafe { start.add(i).write(value) };

@@ -57,6 +57,12 @@ impl BeltRect {
         ]
     }
 
+    /// Whether a point of the belt is inside, borders included.
+    pub fn contains(&self, x_mm: f64, y_mm: f64) -> bool {
+        (self.x_min_mm..=self.x_max_mm).contains(&x_mm)
+            && (self.y_min_mm..=self.y_max_mm).contains(&y_mm)
+    }
+
     /// Length along travel.
     pub fn length_mm(&self) -> f64 {
         self.x_max_mm - self.x_min_mm

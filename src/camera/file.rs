@@ -3,18 +3,18 @@
 use super::{Camera, Lens, LensModel};
 use crate::error::{Error, Result};
 use nalgebra::{Matrix3, Vector3};
-use serde::{Deserialize, Serialize};
+use serde::Deserialize;
 use std::path::Path;
 
 /// The file as written. Unknown keys are allowed: calibration reports add to it.
-#[derive(Clone, Debug, Deserialize, Serialize)]
+#[derive(Clone, Debug, Deserialize)]
 pub struct CameraFile {
     image_size_px: [usize; 2],
     lens: LensTable,
     pose: Option<PoseTable>,
 }
 
-#[derive(Clone, Debug, Deserialize, Serialize)]
+#[derive(Clone, Debug, Deserialize)]
 struct LensTable {
     model: LensModel,
     fx_px: f64,
@@ -24,7 +24,7 @@ struct LensTable {
     distortion: Vec<f64>,
 }
 
-#[derive(Clone, Debug, Deserialize, Serialize)]
+#[derive(Clone, Debug, Deserialize)]
 struct PoseTable {
     rotation: [[f64; 3]; 3],
     translation_mm: [f64; 3],
@@ -40,12 +40,14 @@ impl CameraFile {
         let text = std::fs::read_to_string(path).map_err(|e| {
             Error::configuration(format!("cannot read the camera calibration: {e}"))
                 .in_file(path)
-                .remedy("set camera.calibration to the file that `calibrate belt` wrote")
+                .remedy(
+                    "set camera.calibration to a file with [lens] and [pose], as in config/example",
+                )
         })?;
         let file: Self = toml::from_str(&text).map_err(|e| {
             Error::configuration(format!("not a camera calibration: {}", e.to_string().trim_end()))
                 .in_file(path)
-                .remedy("correct the line shown, or run `calibrate belt` again")
+                .remedy("correct the line shown; config/example has a whole file")
         })?;
         file.into_camera().map_err(|e| e.in_file(path))
     }
@@ -60,8 +62,9 @@ impl CameraFile {
         }
         let lens = self.lens.into_lens(self.image_size_px)?;
         let pose = self.pose.ok_or_else(|| {
-            Error::configuration("[pose] is missing: a lens alone does not know the belt")
-                .remedy("run `calibrate belt` with this file as --lens")
+            Error::configuration("[pose] is missing: a lens alone does not know the belt").remedy(
+                "add rotation and translation_mm of the camera over the belt, as in config/example",
+            )
         })?;
         let (camera_from_belt, translation_mm) = pose.into_transform()?;
         let camera =

@@ -6,7 +6,7 @@ use crate::units::RawPx;
 use nalgebra::{Matrix2, Vector2, Vector3};
 
 /// Which polynomial bends the rays.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, serde::Deserialize, serde::Serialize)]
+#[derive(Clone, Copy, Debug, PartialEq, Eq, serde::Deserialize)]
 #[serde(rename_all = "lowercase")]
 pub enum LensModel {
     /// Radial k1 k2 k3 and tangential p1 p2 terms on the normalised image plane.

@@ -27,9 +27,7 @@ pub struct BeltView {
 }
 
 impl BeltView {
-    /// The view that holds every image of an object up to `height_max_mm` standing in `zone`,
-    /// cut to what the camera's image holds. Never empty for a zone that the camera sees.
-    pub fn covering(camera: &Camera, zone: &BeltRect, height_max_mm: f64, mm_per_px: f64) -> Self {
+    fn full(camera: &Camera, zone: &BeltRect, height_max_mm: f64, mm_per_px: f64) -> Self {
         let centre = camera.centre_in_belt();
         let (nadir, camera_height_mm) = (Vector2::new(centre.x, centre.y), centre.z);
         let margin_mm = MARGIN_PX * mm_per_px;
@@ -40,14 +38,29 @@ impl BeltView {
         let y_min = zone.y_min_mm.min(away(zone.y_min_mm, nadir.y)) - margin_mm;
         let y_max = zone.y_max_mm.max(away(zone.y_max_mm, nadir.y)) + margin_mm;
         let count = |length_mm: f64| (length_mm / mm_per_px).ceil() as usize + 1;
-        let full = Self {
+        Self {
             size_px: [count(x_max - x_min), count(y_max - y_min)],
             mm_per_px,
             origin: BeltMm { x: x_min, y: y_max },
             nadir,
             camera_height_mm,
-        };
-        full.cut_to_image(camera)
+        }
+    }
+
+    /// Columns and rows before anything is cut to the camera's image.
+    pub fn full_size_px(
+        camera: &Camera,
+        zone: &BeltRect,
+        height_max_mm: f64,
+        mm_per_px: f64,
+    ) -> [usize; 2] {
+        Self::full(camera, zone, height_max_mm, mm_per_px).size_px
+    }
+
+    /// The view that holds every image of an object up to `height_max_mm` standing in `zone`,
+    /// cut to what the camera's image holds. Never empty for a zone that the camera sees.
+    pub fn covering(camera: &Camera, zone: &BeltRect, height_max_mm: f64, mm_per_px: f64) -> Self {
+        Self::full(camera, zone, height_max_mm, mm_per_px).cut_to_image(camera)
     }
 
     /// The bounding box of the pixels that the camera sees, found on a coarse grid.
@@ -77,11 +90,6 @@ impl BeltView {
             size_px: [u1 - u0 + 1, v1 - v0 + 1],
             ..self
         }
-    }
-
-    /// Pixels in the view.
-    pub fn area_px(&self) -> usize {
-        self.size_px[0] * self.size_px[1]
     }
 
     /// Point of the belt plane at a view pixel.

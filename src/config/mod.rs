@@ -7,7 +7,7 @@ pub use schema::{Background, Config, Limits, Modbus, Odometry, Segment, View};
 
 use crate::camera::{BeltView, Camera, CameraFile};
 use crate::error::{Error, Result};
-use crate::units::BeltRect;
+use crate::units::{BeltMm, BeltRect};
 use nalgebra::Vector3;
 use std::path::Path;
 
@@ -52,15 +52,33 @@ impl Site {
                     .remedy("check [zone] and the calibration's [pose]")
             })?,
         };
-        let view = BeltView::covering(&camera, &zone, height_max_mm, mm_per_px);
         // Kernels index columns with 16 bits.
-        if view.size_px.iter().any(|&n| n > 8192) {
-            let [w, h] = view.size_px;
+        let [w, h] = BeltView::full_size_px(&camera, &zone, height_max_mm, mm_per_px);
+        if w.max(h) > 8192 {
             return Err(Error::configuration(format!("the belt view would be {w} x {h} px"))
                 .allowed("8192 px a side")
-                .remedy("set a larger view.mm_per_px or a smaller zone"));
+                .remedy(
+                    "set a larger view.mm_per_px, a smaller zone or a lower view.height_max_mm",
+                ));
         }
+        let view = BeltView::covering(&camera, &zone, height_max_mm, mm_per_px);
         Ok(Self { config, camera, view, height_max_mm })
+    }
+}
+
+impl Site {
+    /// Refuse frames of another size than the calibration's.
+    pub fn check_image_size(&self, [width, height]: [usize; 2]) -> Result<()> {
+        let expected = self.camera.image_size_px;
+        if [width, height] == expected {
+            return Ok(());
+        }
+        Err(Error::configuration(format!("the input has frames of {width} x {height} px"))
+            .allowed(format!(
+                "{} x {} px, the calibration's image_size_px",
+                expected[0], expected[1]
+            ))
+            .remedy("use the calibration of this camera and image size"))
     }
 }
 
@@ -80,8 +98,20 @@ fn height_max(view: &View, camera_height_mm: f64) -> Result<f64> {
     }
 }
 
+/// Points checked on each side of the zone.
+const SIDE_POINTS: u32 = 16;
+
 fn check_zone_in_view(camera: &Camera, zone: &BeltRect) -> Result<()> {
-    for corner in zone.corners() {
+    // Between its corners a side may bulge out of a distorted image.
+    let [a, b, c, d] = zone.corners();
+    let along = |from: BeltMm, to: BeltMm| {
+        (0..SIDE_POINTS).map(move |i| {
+            let t = f64::from(i) / f64::from(SIDE_POINTS);
+            BeltMm { x: from.x + t * (to.x - from.x), y: from.y + t * (to.y - from.y) }
+        })
+    };
+    let sides = along(a, b).chain(along(b, c)).chain(along(c, d)).chain(along(d, a));
+    for corner in sides {
         let raw = camera.project(Vector3::new(corner.x, corner.y, 0.0));
         if raw.is_some_and(|px| camera.sees(px)) {
             continue;
@@ -92,11 +122,14 @@ fn check_zone_in_view(camera: &Camera, zone: &BeltRect) -> Result<()> {
         };
         let [width, height] = camera.image_size_px;
         return Err(Error::configuration(format!(
-            "the zone's corner x = {} mm, y = {} mm is outside the camera's view: {image}",
+            "the zone's border at x = {:.0} mm, y = {:.0} mm is outside the camera's view: {image}",
             corner.x, corner.y
         ))
         .at("[zone]")
-        .allowed(format!("corners inside the {width} x {height} px image{}", visible_range(camera)))
+        .allowed(format!(
+            "a border inside the {width} x {height} px image{}",
+            visible_range(camera)
+        ))
         .remedy("make the zone smaller, or check its unit (mm) and the calibration's [pose]"));
     }
     Ok(())

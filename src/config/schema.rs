@@ -221,11 +221,11 @@ impl Config {
             range("view.height_max_mm", mm, 5.0, 5_000.0, "mm")?;
         }
         count("background.learn_frames", background.learn_frames as usize, 1, 1000)?;
-        count("background.history_frames", background.history_frames as usize, 20, 20_000)?;
+        count("background.history_frames", background.history_frames as usize, 20, 2000)?;
         range("background.threshold_sigma", background.threshold_sigma, 1.0, 10.0, "")?;
         range("background.shadow_ratio_min", background.shadow_ratio_min, 0.1, 1.0, "")?;
         let deep = background.deep_shadow_ratio_min;
-        range("background.deep_shadow_ratio_min", deep, 0.0, background.shadow_ratio_min, "")?;
+        range("background.deep_shadow_ratio_min", deep, 0.0, 1.0, "")?;
         count("segment.open_px", segment.open_px, 0, 10)?;
         count("segment.close_px", segment.close_px, 0, 30)?;
         range("segment.area_min_mm2", segment.area_min_mm2, 1.0, 1e6, "mm2")?;
@@ -245,8 +245,8 @@ fn range(key: &str, value: f64, min: f64, max: f64, unit: &str) -> Result<()> {
     if (min..=max).contains(&value) {
         return Ok(());
     }
-    let remedy = if unit.starts_with("mm") && value.abs() < min.max(1.0) && value != 0.0 {
-        "this looks like metres or centimetres: write it in mm"
+    let remedy = if unit.starts_with("mm") && (min..=max).contains(&(1000.0 * value)) {
+        "this looks like metres: write it in mm"
     } else {
         "correct the value"
     };

@@ -95,7 +95,7 @@ pub fn draw(
     let above = seen().map(|p| p.y).min().unwrap_or(0);
     canvas.text(
         &text,
-        Point::new(right.clamp(4, width as i32 - 190), above.clamp(18, height as i32 - 90)),
+        Point::new(right.min(width as i32 - 190).max(4), above.min(height as i32 - 90).max(18)),
     );
     let path = folder.join(format!("parcel_{:04}.png", record.seq));
     image::save_buffer(&path, &canvas.rgb, width as u32, height as u32, image::ColorType::Rgb8)

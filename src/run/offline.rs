@@ -35,19 +35,12 @@ pub fn measure(
     observer: &mut dyn Observer,
 ) -> Result<Counters> {
     let [width, height] = source.size_px();
-    let expected = site.camera.image_size_px;
-    if [width, height] != expected {
-        return Err(Error::configuration(format!("the input has frames of {width} x {height} px"))
-            .allowed(format!(
-                "{} x {} px, the calibration's image_size_px",
-                expected[0], expected[1]
-            ))
-            .remedy("use the calibration of this camera and image size"));
-    }
+    site.check_image_size([width, height])?;
     let mut annotator = outputs.annotate.map(|f| Annotator::new(f, [width, height])).transpose()?;
-    let mut lines = outputs.jsonl.map(JsonLines::create).transpose()?;
     let (mut frames, mut pipeline) = memory::build(site)?;
     let mut frame = frames.pop().ok_or_else(|| Error::failure("no frame was planned"))?;
+    // Only now: an earlier run's records survive a start that fails.
+    let mut lines = outputs.jsonl.map(JsonLines::create).transpose()?;
     let mut records: Vec<ParcelRecord> = Vec::new();
     let mut last_index = 0;
     loop {

@@ -11,6 +11,9 @@ use crate::error::{Error, Result};
 use crate::image::FrameTime;
 use std::path::Path;
 
+/// Frame rates that make sense: slower, a parcel is hardly seen twice.
+const FPS: std::ops::RangeInclusive<f64> = 0.5..=10_000.0;
+
 /// A stream of mono frames of one size.
 pub trait FrameSource: Send {
     /// Width and height of every frame.
@@ -30,9 +33,13 @@ pub trait FrameSource: Send {
 /// Open a replay: a Y4M file, `-` for Y4M on standard input, or a directory of images.
 pub fn open(input: &Path, fps: Option<f64>) -> Result<Box<dyn FrameSource>> {
     if let Some(fps) = fps
-        && !(0.01..=10_000.0).contains(&fps)
+        && !FPS.contains(&fps)
     {
-        return Err(Error::configuration(format!("--fps {fps}")).allowed("0.01 to 10000"));
+        return Err(Error::configuration(format!("--fps {fps}")).allowed(format!(
+            "{} to {} frames a second",
+            FPS.start(),
+            FPS.end()
+        )));
     }
     if input == Path::new("-") {
         return Ok(Box::new(Y4m::new(Box::new(std::io::stdin()), "standard input", fps)?));

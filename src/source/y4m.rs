@@ -2,7 +2,7 @@
 //!
 //! Source: the format's description in mjpegtools, yuv4mpeg(5).
 
-use super::FrameSource;
+use super::{FPS, FrameSource};
 use crate::error::{Error, Result};
 use crate::image::FrameTime;
 use std::io::{BufRead, BufReader, Read};
@@ -34,7 +34,10 @@ impl Y4m {
         let line = read_line(&mut reader)
             .map_err(|e| Error::failure(format!("cannot read: {e}")).at(name))?
             .ok_or_else(|| wrong("the input is empty".to_owned()))?;
-        let mut fields = line.split(' ');
+        if line.len() as u64 >= LINE_BYTES_MAX {
+            return Err(wrong("the stream header is too long".to_owned()));
+        }
+        let mut fields = line.trim_end().split(' ');
         if fields.next() != Some("YUV4MPEG2") {
             return Err(wrong("the input is not a YUV4MPEG2 stream".to_owned()));
         }
@@ -63,9 +66,10 @@ impl Y4m {
             }
             other => return Err(wrong(format!("colour space C{other} is not supported"))),
         };
-        let fps = fps
-            .or(rate)
-            .ok_or_else(|| wrong("the stream has no frame rate F: give --fps".to_owned()))?;
+        let fps = fps.or(rate).filter(|fps| FPS.contains(fps)).ok_or_else(|| {
+            wrong(format!("the stream header has no usable frame rate F: {line}"))
+                .remedy("give the camera's frames a second with --fps")
+        })?;
         Ok(Self {
             reader,
             name: name.to_owned(),

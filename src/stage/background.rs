@@ -47,7 +47,7 @@ pub struct Background {
     strong: Block<u64>,
     gain_histogram: Block<u32>,
     /// Model brightness over scene brightness, Q12.
-    gain: u32,
+    gain_q12: u32,
     frames: u32,
 }
 
@@ -81,7 +81,7 @@ impl Background {
             dark: memory.take("background.dark", 0)?,
             strong: memory.take("background.strong", 0)?,
             gain_histogram: memory.take("background.gain", 0)?,
-            gain: GAIN_ONE,
+            gain_q12: GAIN_ONE,
             frames: 0,
         })
     }
@@ -89,7 +89,7 @@ impl Background {
     /// Classify and learn one frame. `seen` and `hold` are bit masks of the view.
     pub fn step(&mut self, view: Plane<'_>, seen: &[u64], hold: &[u64]) {
         if self.frames > 0 {
-            self.gain = self.estimate_gain(view, seen);
+            self.gain_q12 = self.estimate_gain(view, seen);
         }
         self.frames = self.frames.saturating_add(1);
         let params = self.params();
@@ -117,25 +117,28 @@ impl Background {
         let sigma = self.settings.threshold_sigma;
         let history = self.frames.min(self.settings.history_frames);
         Params {
-            rate: 65536 / history,
-            gain: self.gain,
-            match_d2: 9 << 8, // 3 sigma, as in Zivkovic 2004
-            background_d2: (sigma * sigma * 256.0) as u32,
-            background_share: 58982, // 0.9
-            shadow_ratio: (self.settings.shadow_ratio_min * 256.0) as u32,
-            dark_ratio: (self.settings.deep_shadow_ratio_min * 256.0) as u32,
+            rate_q16: 65536 / history,
+            gain_q12: self.gain_q12,
+            match_d2_q8: 9 << 8, // 3 sigma, as in Zivkovic 2004
+            background_d2_q8: (sigma * sigma * 256.0) as u32,
+            background_share_q16: 58982, // 0.9
+            shadow_ratio_q8: (self.settings.shadow_ratio_min * 256.0) as u32,
+            dark_ratio_q8: (self.settings.deep_shadow_ratio_min * 256.0) as u32,
         }
     }
 
-    /// Median of model over scene brightness on the grid, then the mean of the ratios near it.
+    /// Model over scene brightness: the median of scene over model on the grid finds the belt,
+    /// the mean of the ratios near it is the gain. What was foreground does not vote.
     fn estimate_gain(&mut self, view: Plane<'_>, seen: &[u64]) -> u32 {
         let (n, width) = (words(self.width), self.width);
         let mean = &self.modes[0].mean;
+        let foreground = &self.foreground;
         let grid = |v: usize| {
             let row = view.row(v);
             (0..width).step_by(GAIN_GRID_PX).filter_map(move |u| {
                 let model = mean[v * width + u];
-                let visible = seen[v * n + u / 64] >> (u % 64) & 1 == 1;
+                let is_belt = seen[v * n + u / 64] & !foreground[v * n + u / 64];
+                let visible = is_belt >> (u % 64) & 1 == 1;
                 let bin = u32::from(row[u]) * 256 * GAIN_BIN_ONE / u32::from(model.max(1));
                 (visible && model >= GAIN_MEAN_MIN).then_some((
                     row[u],
@@ -157,7 +160,7 @@ impl Background {
             below += count;
             below * 2 > votes
         });
-        let Some(median) = median else { return self.gain };
+        let Some(median) = median else { return self.gain_q12 };
         let (mut scene, mut model) = (0u64, 0u64);
         for (grey, mean, bin) in rows().flat_map(grid) {
             if bin.abs_diff(median) <= GAIN_BINS_NEAR {
@@ -190,13 +193,8 @@ impl Background {
         &self.strong
     }
 
-    /// Model brightness over scene brightness.
-    pub fn gain(&self) -> f64 {
-        f64::from(self.gain) / f64::from(GAIN_ONE)
-    }
-
     /// A pixel's difference from the belt's mean, in Q8 grey levels at model brightness.
     pub fn difference(&self, grey: u8, index: usize) -> i32 {
-        i32::from(observation(grey, self.gain)) - i32::from(self.modes[0].mean[index])
+        i32::from(observation(grey, self.gain_q12)) - i32::from(self.modes[0].mean[index])
     }
 }

@@ -11,6 +11,7 @@
 use crate::camera::BeltView;
 use crate::error::Result;
 use crate::image::Plane;
+use crate::kernel::scalar::bits;
 use crate::kernel::scalar::correlate::{NO_TEXTURE, Sums, correlate};
 use crate::plan::{Block, Memory, Plan};
 use crate::stage::background::Background;
@@ -177,7 +178,7 @@ impl Odometry {
 
     /// Belt texture of the zone: the view minus the background, where it is belt.
     fn extract(&mut self, view: Plane<'_>, background: &Background, covered: &[u64]) {
-        let words = crate::kernel::scalar::bits::words(self.width);
+        let words = bits::words(self.width);
         let columns = self.columns.clone();
         let rows = self.rows.clone().step_by(ROW_STEP);
         for (v, out) in rows.zip(self.current.chunks_exact_mut(columns.len())) {
@@ -185,7 +186,7 @@ impl Odometry {
             let covered = &covered[v * words..(v + 1) * words];
             for ((u, out), &grey) in columns.clone().zip(out).zip(grey) {
                 let texture = background.difference(grey, v * self.width + u) >> TEXTURE_SHIFT;
-                let is_belt = covered[u / 64] >> (u % 64) & 1 == 0 && texture.abs() <= TEXTURE_MAX;
+                let is_belt = !bits::get(covered, u) && texture.abs() <= TEXTURE_MAX;
                 *out = if is_belt { texture as i8 } else { NO_TEXTURE };
             }
         }

@@ -5,7 +5,7 @@
 
 use crate::config::{Limits, Segment as Settings};
 use crate::error::Result;
-use crate::kernel::scalar::bits::{dilate3x3, erode3x3, words};
+use crate::kernel::scalar::bits::{self, dilate3x3, erode3x3, words};
 use crate::kernel::scalar::runs::{Run, collect, resolve};
 use crate::plan::{Block, Memory, Plan};
 
@@ -156,7 +156,7 @@ impl Segment {
             let (v, u0, u1) = (f32::from(run.v), f32::from(run.start), f32::from(run.end) - 1.0);
             blob.area_px += u32::from(run.end - run.start);
             let row = &strong[usize::from(run.v) * words(self.size_px[0])..];
-            blob.strong_px += count_bits(row, run.start, run.end);
+            blob.strong_px += bits::count(row, run.start, run.end);
             blob.bounds = blob.bounds.union(&PxBox { u0, u1, v0: v, v1: v });
         }
         let mut kept = 0;
@@ -187,32 +187,9 @@ impl Segment {
     }
 }
 
-/// Set bits of `row[start..end]`.
-fn count_bits(row: &[u64], start: u16, end: u16) -> u32 {
-    let (first, last) = (usize::from(start) / 64, usize::from(end - 1) / 64);
-    let from = u64::MAX << (start % 64);
-    let to = u64::MAX >> (63 - (end - 1) % 64);
-    (first..=last)
-        .map(|w| {
-            let mask =
-                if w == first { from } else { u64::MAX } & if w == last { to } else { u64::MAX };
-            (row[w] & mask).count_ones()
-        })
-        .sum()
-}
-
 #[cfg(test)]
 mod tests {
     use super::*;
-
-    #[test]
-    fn bits_are_counted_across_words() {
-        let row = [u64::MAX, 0b1011, u64::MAX];
-        assert_eq!(count_bits(&row, 0, 64), 64);
-        assert_eq!(count_bits(&row, 60, 66), 6);
-        assert_eq!(count_bits(&row, 66, 67), 0);
-        assert_eq!(count_bits(&row, 63, 129), 1 + 3 + 1);
-    }
 
     #[test]
     fn boxes_overlap_where_they_share_pixels() {

@@ -10,7 +10,10 @@ use crate::belt::BeltPosition;
 use crate::error::Result;
 use crate::plan::{Block, Memory, Plan};
 
-/// Overlap with the prediction, as a share of the smaller box, that makes a blob a track's.
+/// Overlap over union of a blob and a track's prediction that makes the blob the track's.
+const SAME_MIN: f32 = 0.2;
+/// Overlap, as a share of the smaller box, that makes a blob a piece of a track not measured
+/// yet, or a track part of another's blob.
 const OVERLAP_MIN: f32 = 0.3;
 /// A blob must have followed the belt this far, px, before its track is believed ...
 const CONFIRM_TRAVEL_PX: f64 = 15.0;
@@ -137,13 +140,14 @@ impl Tracker {
     }
 
     /// Carry the tracks on by `step_mm` of belt travel and give them their blobs.
-    /// `belongs`: whether a blob is part of the parcel measured on a slot.
+    /// `covers`: whether the middle of a box lies in the silhouette of the cuboid measured on a
+    /// slot; `None` when nothing is measured there yet.
     pub fn step(
         &mut self,
         blobs: &[Blob],
         step_mm: f64,
         at: BeltPosition,
-        belongs: &dyn Fn(usize, &Blob) -> bool,
+        covers: &dyn Fn(usize, &PxBox) -> Option<bool>,
     ) {
         self.changes.clear();
         self.owners.fill(NOBODY);
@@ -158,7 +162,17 @@ impl Tracker {
             track.frames = track.frames.saturating_add(1);
         }
         for blob in blobs {
-            self.assign(blob, belongs);
+            if let Some(owner) = self.owner_of(blob, covers) {
+                self.owners[blob.label as usize] = owner as u16;
+            }
+        }
+        for slot in 0..self.tracks.len() {
+            let owns = |b: &Blob| self.owners[b.label as usize] == slot as u16;
+            if self.tracks[slot].phase != Phase::Free && !blobs.iter().any(owns) {
+                self.share(slot, blobs, covers);
+            } else {
+                self.tracks[slot].inside_frames = 0;
+            }
         }
         self.gather(blobs, step_px);
         for blob in blobs {
@@ -169,48 +183,66 @@ impl Tracker {
         self.judge(at);
     }
 
-    /// Give a blob to the parcel whose cuboid it is part of, else to the track that it overlaps
-    /// most; several parcels on one blob are merged.
-    fn assign(&mut self, blob: &Blob, belongs: &dyn Fn(usize, &Blob) -> bool) {
-        let overlap = |t: &Track| {
-            let smaller = t.bounds.area().min(blob.bounds.area());
-            if t.phase == Phase::Free { 0.0 } else { t.bounds.overlap(&blob.bounds) / smaller }
-        };
-        let claims = |t: &Track| overlap(t) > OVERLAP_MIN;
-        let best = |least_frames: u32| {
-            (0..self.tracks.len())
-                .filter(|&s| claims(&self.tracks[s]) && self.tracks[s].frames >= least_frames)
-                .max_by(|&a, &b| {
-                    let area = |s: usize| self.tracks[s].bounds.overlap(&blob.bounds);
-                    area(a).total_cmp(&area(b))
-                })
-        };
-        let part_of = (0..self.tracks.len())
-            .filter(|&s| self.tracks[s].phase != Phase::Free && belongs(s, blob))
-            .max_by_key(|&s| self.tracks[s].frames);
-        let owner = part_of.or_else(|| best(YOUNG_FRAMES)).or_else(|| best(0));
-        let Some(owner) = owner else { return };
-        self.owners[blob.label as usize] = owner as u16;
-        let mut shared = false;
-        for s in (0..self.tracks.len()).filter(|&s| s != owner) {
-            if !claims(&self.tracks[s]) {
-                continue;
+    /// The track that a blob belongs to: the parcel whose cuboid it is part of, the track
+    /// whose prediction it matches, or the one, not measured yet, that it is a piece of.
+    fn owner_of(
+        &self,
+        blob: &Blob,
+        covers: &dyn Fn(usize, &PxBox) -> Option<bool>,
+    ) -> Option<usize> {
+        let claim = |slot: usize| {
+            let track = &self.tracks[slot];
+            if track.phase == Phase::Free {
+                return 0.0;
             }
-            let larger = self.tracks[owner].bounds.union(&blob.bounds);
-            let track = &mut self.tracks[s];
-            let inside = larger.overlap(&track.bounds) >= INSIDE_SHARE * track.bounds.area();
-            track.inside_frames = if inside { track.inside_frames + 1 } else { 0 };
-            let young = track.frames < YOUNG_FRAMES && track.phase == Phase::Candidate;
-            if young || track.inside_frames >= FRAGMENT_FRAMES {
-                // A piece rejoined: what looked like two parcels was one.
-                track.phase = Phase::Free;
-                self.tracks[owner].merged_frames = 0;
-            } else {
-                track.merged = true;
-                shared |= !inside;
+            let overlap = track.bounds.overlap(&blob.bounds);
+            let (a, b) = (track.bounds.area(), blob.bounds.area());
+            let same = overlap / (a + b - overlap);
+            let piece = overlap / a.min(b) > OVERLAP_MIN;
+            match covers(slot, &blob.bounds) {
+                Some(true) => 3.0 + same,
+                // An older track outbids the young one of a piece that was seen apart.
+                None if piece && track.frames >= YOUNG_FRAMES => 2.0 + same,
+                _ if same >= SAME_MIN => 1.0 + same,
+                None if piece => same,
+                _ => 0.0,
             }
+        };
+        let best = (0..self.tracks.len()).max_by(|&x, &y| claim(x).total_cmp(&claim(y)))?;
+        (claim(best) > 0.0).then_some(best)
+    }
+
+    /// A track without a blob of its own: merged into the blob that hides it, or, when it lies
+    /// in that blob's own parcel for long enough, a piece of that parcel.
+    fn share(
+        &mut self,
+        slot: usize,
+        blobs: &[Blob],
+        covers: &dyn Fn(usize, &PxBox) -> Option<bool>,
+    ) {
+        let bounds = self.tracks[slot].bounds;
+        let hides = |b: &&Blob| {
+            let smaller = bounds.area().min(b.bounds.area());
+            self.owners[b.label as usize] != NOBODY
+                && bounds.overlap(&b.bounds) > OVERLAP_MIN * smaller
+        };
+        let overlap = |b: &&Blob| bounds.overlap(&b.bounds);
+        let hidden_by = blobs.iter().filter(hides).max_by(|a, b| overlap(a).total_cmp(&overlap(b)));
+        let Some(blob) = hidden_by else { return };
+        let owner = usize::from(self.owners[blob.label as usize]);
+        let inside = covers(owner, &bounds).unwrap_or_else(|| {
+            let whole = self.tracks[owner].bounds.union(&blob.bounds);
+            whole.overlap(&bounds) >= INSIDE_SHARE * bounds.area()
+        });
+        let track = &mut self.tracks[slot];
+        track.inside_frames = if inside { track.inside_frames + 1 } else { 0 };
+        let young = track.frames < YOUNG_FRAMES && track.phase == Phase::Candidate;
+        if young || track.inside_frames >= FRAGMENT_FRAMES {
+            track.phase = Phase::Free;
+        } else {
+            track.merged = true;
+            self.tracks[owner].merged |= !inside;
         }
-        self.tracks[owner].merged |= shared;
     }
 
     /// Each track's box becomes that of its blobs; the prediction stands when it has none, or
@@ -333,7 +365,7 @@ mod tests {
                     ..Blob::default()
                 })
                 .collect();
-            self.tracker.step(&blobs, step_mm, self.at, &|_, _| false);
+            self.tracker.step(&blobs, step_mm, self.at, &|_, _| None);
         }
 
         fn phases(&self) -> [Phase; TRACKS] {

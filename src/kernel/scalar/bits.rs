@@ -16,6 +16,36 @@ pub const fn last_word_mask(width: usize) -> u64 {
     }
 }
 
+/// Bit `u` of a row.
+pub fn get(row: &[u64], u: usize) -> bool {
+    row[u / 64] >> (u % 64) & 1 == 1
+}
+
+/// Set bits `start..end` of a row.
+pub fn set(row: &mut [u64], start: u16, end: u16) {
+    for_words(start, end, |w, mask| row[w] |= mask);
+}
+
+/// Count the set bits of `row[start..end]`.
+pub fn count(row: &[u64], start: u16, end: u16) -> u32 {
+    let mut sum = 0;
+    for_words(start, end, |w, mask| sum += (row[w] & mask).count_ones());
+    sum
+}
+
+/// The words that bits `start..end` lie in, each with the mask of these bits.
+fn for_words(start: u16, end: u16, mut visit: impl FnMut(usize, u64)) {
+    if start >= end {
+        return;
+    }
+    let (first, last) = (usize::from(start) / 64, usize::from(end - 1) / 64);
+    for w in first..=last {
+        let from = if w == first { u64::MAX << (start % 64) } else { u64::MAX };
+        let to = if w == last { u64::MAX >> (63 - (end - 1) % 64) } else { u64::MAX };
+        visit(w, from & to);
+    }
+}
+
 /// 3x3 dilation of `src` into `dst`, rows of `width` pixels.
 pub fn dilate3x3(src: &[u64], dst: &mut [u64], width: usize) {
     filter3x3(src, dst, width, false);
@@ -74,6 +104,21 @@ mod tests {
             }
         }
         out
+    }
+
+    #[test]
+    fn bits_are_set_and_counted_across_words() {
+        let row = [u64::MAX, 0b1011, u64::MAX];
+        let counts = [(0, 64, 64), (60, 66, 6), (66, 67, 0), (63, 129, 5), (9, 9, 0)];
+        for (start, end, expected) in counts {
+            assert_eq!(count(&row, start, end), expected, "{start}..{end}");
+        }
+        for (start, end) in [(0, 64), (60, 66), (63, 129), (5, 5), (64, 128)] {
+            let mut row = [0; 3];
+            set(&mut row, start, end);
+            assert_eq!(count(&row, 0, 192), u32::from(end - start));
+            assert!((start..end).all(|u| get(&row, usize::from(u))));
+        }
     }
 
     #[test]

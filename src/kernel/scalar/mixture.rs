@@ -24,19 +24,19 @@ pub struct ModeRow<'a> {
 #[derive(Clone, Copy, Debug)]
 pub struct Params {
     /// Learning rate, Q16.
-    pub rate: u32,
+    pub rate_q16: u32,
     /// Scene brightness to model brightness, Q12: an observation is multiplied by it.
-    pub gain: u32,
+    pub gain_q12: u32,
     /// Squared Mahalanobis distance within which an observation belongs to a mode, Q8.
-    pub match_d2: u32,
+    pub match_d2_q8: u32,
     /// The same for "is background", Q8.
-    pub background_d2: u32,
+    pub background_d2_q8: u32,
     /// Modes that together hold this share are background, Q16.
-    pub background_share: u32,
+    pub background_share_q16: u32,
     /// Shadow when at least this fraction of the background, Q8.
-    pub shadow_ratio: u32,
+    pub shadow_ratio_q8: u32,
     /// Darker than a shadow, but possibly a deep one, when at least this fraction, Q8.
-    pub dark_ratio: u32,
+    pub dark_ratio_q8: u32,
 }
 
 /// Variance of a new mode: 5 grey levels squared, Q8.
@@ -84,12 +84,12 @@ pub struct Masks {
 pub fn update(grey: &[u8], modes: &mut [ModeRow<'_>; MODES], hold: u64, params: &Params) -> Masks {
     let mut masks = Masks::default();
     for (i, &value) in grey.iter().enumerate() {
-        let x = observation(value, params.gain);
+        let x = observation(value, params.gain_q12);
         let class = classify(x, modes, i, params);
         masks.foreground |= u64::from(matches!(class, Class::Foreground | Class::Dark)) << i;
         masks.dark |= u64::from(class == Class::Dark) << i;
         if class != Class::Background && class != Class::Shadow {
-            let far = 4 * params.background_d2;
+            let far = 4 * params.background_d2_q8;
             let strong = !within(x, modes[0].mean[i], modes[0].variance[i], far);
             masks.strong |= u64::from(strong) << i;
         }
@@ -116,17 +116,17 @@ pub fn classify(x: u16, modes: &[ModeRow<'_>; MODES], i: usize, params: &Params)
     let mut class = Class::Foreground;
     for mode in modes {
         let (weight, mean) = (mode.weight[i], mode.mean[i]);
-        if weight == 0 || share >= params.background_share {
+        if weight == 0 || share >= params.background_share_q16 {
             break;
         }
-        if within(x, mean, mode.variance[i], params.background_d2) {
+        if within(x, mean, mode.variance[i], params.background_d2_q8) {
             return Class::Background;
         }
         let keeps = |ratio: u32| u32::from(x) << 8 >= ratio * u32::from(mean);
         if x < mean && mean >= SHADOW_MEAN_MIN {
-            if keeps(params.shadow_ratio) {
+            if keeps(params.shadow_ratio_q8) {
                 class = Class::Shadow;
-            } else if keeps(params.dark_ratio) && class == Class::Foreground {
+            } else if keeps(params.dark_ratio_q8) && class == Class::Foreground {
                 class = Class::Dark;
             }
         }
@@ -143,21 +143,21 @@ fn learn(x: u16, modes: &mut [ModeRow<'_>; MODES], i: usize, params: &Params) {
             break;
         }
         let belongs =
-            matched.is_none() && within(x, mode.mean[i], mode.variance[i], params.match_d2);
-        let decayed = weight - ((weight * params.rate) >> 16);
+            matched.is_none() && within(x, mode.mean[i], mode.variance[i], params.match_d2_q8);
+        let decayed = weight - ((weight * params.rate_q16) >> 16);
         if belongs {
             matched = Some(m);
-            let grown = (decayed + params.rate).min(65535);
+            let grown = (decayed + params.rate_q16).min(65535);
             mode.weight[i] = grown as u16;
-            move_mode(x, mode, i, params.rate, grown);
+            move_mode(x, mode, i, params.rate_q16, grown);
         } else {
             // Eq. 14: the prior takes c_T a step, and a mode with nothing left is removed.
-            mode.weight[i] = decayed.saturating_sub(params.rate >> PRUNE_SHIFT) as u16;
+            mode.weight[i] = decayed.saturating_sub(params.rate_q16 >> PRUNE_SHIFT) as u16;
         }
     }
     match matched {
         Some(m) => raise(modes, i, m),
-        None => insert(x, modes, i, params.rate),
+        None => insert(x, modes, i, params.rate_q16),
     }
 }
 
@@ -206,13 +206,13 @@ mod tests {
     impl Model {
         fn step(&mut self, grey: u8, hold: u64, rate: u32) -> bool {
             let params = Params {
-                rate,
-                gain: 1 << 12,
-                match_d2: 9 << 8,
-                background_d2: 16 << 8,
-                background_share: 58982,
-                shadow_ratio: 184,
-                dark_ratio: 77,
+                rate_q16: rate,
+                gain_q12: 1 << 12,
+                match_d2_q8: 9 << 8,
+                background_d2_q8: 16 << 8,
+                background_share_q16: 58982,
+                shadow_ratio_q8: 184,
+                dark_ratio_q8: 77,
             };
             let mut rows = self.0.each_mut().map(|[weight, mean, variance]| ModeRow {
                 weight: std::slice::from_mut(weight),

@@ -9,7 +9,7 @@ use super::model::{
     DIRECTIONS, EDGES, EdgeId, HEIGHT, LENGTH, N, Outline, Params, SCALE, WIDTH, X, Y, YAW,
     canonical, direction,
 };
-use super::observe::{EdgeSample, View};
+use super::observe::{EdgeSample, PassView};
 use crate::camera::BeltView;
 use crate::units::BeltRect;
 use nalgebra::{SMatrix, SVector, Vector2};
@@ -41,6 +41,8 @@ const SIDE_DEPTH_NONE_PX: f64 = 0.3;
 const BASE_TRUST: f64 = 0.2;
 /// In between, a top edge counts this much: enough when there is nothing better.
 const NARROW_SIDE_TRUST: f64 = 0.05;
+/// No edge of a face is further inside the silhouette than this share of the parcel.
+const INSIDE_MAX: f64 = 0.3;
 /// Profiles on neighbouring places and frames share their errors; this many count as one.
 const CORRELATED_SAMPLES: f64 = 20.0;
 /// Below this no dimension is trusted, mm: lens model, edge rounding.
@@ -142,7 +144,7 @@ struct EdgeUse {
 
 impl Problem<'_> {
     /// Fit silhouettes only, from `start` or from scratch.
-    pub fn fit_reach(&self, views: &[View], start: Option<Params>) -> Option<Estimate> {
+    pub fn fit_reach(&self, views: &[PassView], start: Option<Params>) -> Option<Estimate> {
         let candidates = match start {
             Some(params) => [Some(params), None, None],
             None => [0.1, 0.35, 0.75].map(|share| self.start(views, share * self.height_max_mm)),
@@ -162,7 +164,7 @@ impl Problem<'_> {
     /// Fit edges, starting from an estimate of the silhouettes. On a side that faces the camera
     /// the strongest edge may be the top one or the one on the belt: both are tried, and the
     /// cuboid that explains more contrast is kept.
-    pub fn fit_edges(&self, views: &[View], start: Params) -> Option<Estimate> {
+    pub fn fit_edges(&self, views: &[PassView], start: Params) -> Option<Estimate> {
         let found = self.face_votes(views, &start);
         let mut best: Option<Estimate> = None;
         for as_base in 0..16u8 {
@@ -184,7 +186,7 @@ impl Problem<'_> {
     }
 
     /// Gauss-Newton on the edges, the gate closing.
-    fn refine_edges(&self, views: &[View], start: Params) -> Option<Estimate> {
+    fn refine_edges(&self, views: &[PassView], start: Params) -> Option<Estimate> {
         let mut params = start;
         let mut polarity = [0.0; EDGES];
         let mut last = None;
@@ -206,7 +208,7 @@ impl Problem<'_> {
     }
 
     /// Where most profiles of the whole pass agree on an edge at each face.
-    fn face_votes(&self, views: &[View], params: &Params) -> [FaceVote; 4] {
+    fn face_votes(&self, views: &[PassView], params: &Params) -> [FaceVote; 4] {
         let mut votes = [[0.0f64; VOTE_BINS]; 4];
         let mut depth = [(0.0, 0u32); 4];
         let mut sampled = 0;
@@ -239,8 +241,11 @@ impl Problem<'_> {
             // A side seen in passing shows its base edge smeared: no peak to mistake.
             let confusing =
                 2 * count > sampled && mean > SIDE_DEPTH_MIN_PX * self.geometry.mm_per_px;
+            // An edge further inside than this is the other side's, or a stripe's.
+            let extent_mm = params[if k % 2 == 0 { LENGTH } else { WIDTH }];
+            let inside_px = INSIDE_MAX * m * extent_mm / self.geometry.mm_per_px;
             FaceVote {
-                offset_mm: outermost_peak(&votes[k])
+                offset_mm: outermost_peak(&votes[k], -inside_px)
                     .map_or(0.0, |px| px * self.geometry.mm_per_px / m),
                 side_depth_mm: confusing.then_some(mean / m),
             }
@@ -291,27 +296,37 @@ impl Problem<'_> {
         })
     }
 
-    /// A start from the view that shows the most: the direction of least bounding area.
-    fn start(&self, views: &[View], height_mm: f64) -> Option<Params> {
-        let view = views.iter().max_by_key(|v| v.reach_count()[self.silhouette as usize])?;
-        let reach = |k: usize| f64::from(view.reach_mm[self.silhouette as usize][k % DIRECTIONS]);
-        let extent = |k: usize| reach(k) + reach(k + DIRECTIONS / 2);
-        let quarter = DIRECTIONS / 4;
-        let k = (0..quarter).filter(|&k| (extent(k) * extent(k + quarter)).is_finite()).min_by(
-            |&a, &b| {
-                (extent(a) * extent(a + quarter)).total_cmp(&(extent(b) * extent(b + quarter)))
-            },
-        )?;
-        let middle = |k: usize| 0.5 * (reach(k) - reach(k + DIRECTIONS / 2));
-        let image = direction(k) * middle(k) + direction(k + quarter) * middle(k + quarter);
+    /// A start from all views: how far the parcel reaches in each direction, its motion taken
+    /// out, and the direction of least bounding area. No view need show both ends.
+    fn start(&self, views: &[PassView], height_mm: f64) -> Option<Params> {
         let m = self.geometry.magnification(height_mm);
+        let reach = |k: usize| {
+            let (k, d) = (k % DIRECTIONS, direction(k % DIRECTIONS));
+            let (mut sum, mut count) = (0.0, 0);
+            for view in views {
+                let reach_mm = f64::from(view.reach_mm[self.silhouette as usize][k]);
+                if reach_mm.is_finite() {
+                    sum += reach_mm - m * d.x * (view.travel_mm - self.reference_travel_mm);
+                    count += 1;
+                }
+            }
+            sum / f64::from(count) // NaN without a view
+        };
+        let reaches: [f64; DIRECTIONS] = std::array::from_fn(reach);
+        let extent =
+            |k: usize| reaches[k % DIRECTIONS] + reaches[(k + DIRECTIONS / 2) % DIRECTIONS];
+        let quarter = DIRECTIONS / 4;
+        let area = |k: usize| extent(k) * extent(k + quarter);
+        let k = (0..quarter)
+            .filter(|&k| area(k).is_finite())
+            .min_by(|&a, &b| area(a).total_cmp(&area(b)))?;
+        let middle = |k: usize| 0.5 * (reaches[k] - reaches[k + DIRECTIONS / 2]);
+        let image = direction(k) * middle(k) + direction(k + quarter) * middle(k + quarter);
         let centre = self.geometry.nadir + (image - self.geometry.nadir) / m;
-        let travel = view.travel_mm - self.reference_travel_mm;
-        let yaw = direction(k).y.atan2(direction(k).x);
         Some(Params::from([
-            centre.x - travel,
+            centre.x,
             centre.y,
-            yaw,
+            direction(k).y.atan2(direction(k).x),
             (extent(k) / m).max(SIDE_MIN_MM),
             (extent(k + quarter) / m).max(SIDE_MIN_MM),
             height_mm,
@@ -320,7 +335,7 @@ impl Problem<'_> {
     }
 
     /// Levenberg-Marquardt on the silhouettes.
-    fn descend(&self, views: &[View], start: Params, iterations: usize) -> (f64, Params) {
+    fn descend(&self, views: &[PassView], start: Params, iterations: usize) -> (f64, Params) {
         let (mut params, mut damping) = (start, 1e-3);
         let (mut normal, _) = self.reach_normal(views, &params);
         for _ in 0..iterations {
@@ -364,7 +379,7 @@ impl Problem<'_> {
     }
 
     /// Priors and silhouettes.
-    fn reach_normal(&self, views: &[View], params: &Params) -> (Normal, f64) {
+    fn reach_normal(&self, views: &[PassView], params: &Params) -> (Normal, f64) {
         let mut normal = self.priors(params);
         let mean_square = self.add_reach(views, params, REACH_SIGMA_MM, &mut normal);
         (normal, mean_square)
@@ -373,7 +388,7 @@ impl Problem<'_> {
     /// Silhouette residuals (Huber). Returns their mean square, in units of the blobs' sigma.
     fn add_reach(
         &self,
-        views: &[View],
+        views: &[PassView],
         params: &Params,
         sigma_mm: f64,
         normal: &mut Normal,
@@ -400,7 +415,7 @@ impl Problem<'_> {
     /// Edge residuals (biweight) with the step that each profile offers within the gate.
     fn add_edges(
         &self,
-        views: &[View],
+        views: &[PassView],
         params: &Params,
         gate_mm: f64,
         polarity: &[f64; EDGES],
@@ -461,8 +476,8 @@ impl Problem<'_> {
         let normal = Vector2::new(along.y, -along.x) / length;
         let facing = normal.dot(&outward);
         let t = (anchor - a.image).dot(&along) / (length * length);
-        let x_over_belt = a.over_belt.x + t * (b.over_belt.x - a.over_belt.x);
-        let in_zone = (self.zone.x_min_mm..=self.zone.x_max_mm).contains(&x_over_belt);
+        let over_belt = a.over_belt + (b.over_belt - a.over_belt) * t;
+        let in_zone = self.zone.contains(over_belt.x, over_belt.y);
         // Near a corner the neighbouring edge takes over.
         if !(0.04..=0.96).contains(&t) || facing < 0.9 || !in_zone {
             return None;
@@ -473,16 +488,18 @@ impl Problem<'_> {
     }
 }
 
-/// Offset, px, of the outermost place where the signed votes agree; `None` without votes.
-fn outermost_peak(votes: &[f64; VOTE_BINS]) -> Option<f64> {
+/// Offset, px, from `first_px` on, of the outermost place where the signed votes agree; `None`
+/// without votes.
+fn outermost_peak(votes: &[f64; VOTE_BINS], first_px: f64) -> Option<f64> {
     // Neighbours within a pixel and a half are the same edge.
     let smooth = |i: usize| votes[i - 1..=i + 1].iter().sum::<f64>().abs();
-    let inner = || 1..VOTE_BINS - 1;
+    let first = ((first_px - VOTE_FIRST_PX) / VOTE_BIN_PX).ceil().max(1.0) as usize;
+    let inner = || first.min(VOTE_BINS - 1)..VOTE_BINS - 1;
     let most = inner().map(smooth).fold(0.0, f64::max);
     let peak = inner().rev().find(|&i| {
         let here = smooth(i);
         let below = i + 1 == VOTE_BINS - 1 || smooth(i + 1) <= here;
-        most > 0.0 && here >= VOTE_SHARE * most && below && (i == 1 || smooth(i - 1) <= here)
+        most > 0.0 && here >= VOTE_SHARE * most && below && (i == first || smooth(i - 1) <= here)
     })?;
     Some(VOTE_FIRST_PX + (peak as f64 + 0.5) * VOTE_BIN_PX)
 }

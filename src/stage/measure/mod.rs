@@ -21,14 +21,14 @@ use crate::kernel::scalar::runs::Run;
 use crate::plan::{Block, Memory, Plan};
 use crate::units::BeltRect;
 use fit::{Problem, Silhouette, canonical_estimate};
-use observe::View;
+use observe::PassView;
 
 /// A first estimate needs this many views ...
 const FIRST_FIT_VIEWS: usize = 4;
 /// ... over this much travel, mm: height shows only in motion.
 const FIRST_FIT_TRAVEL_MM: f64 = 50.0;
-/// Directions a view must show to count towards the first estimate.
-const REACH_COUNT_MIN: usize = 24;
+/// ... that together showed the parcel from this many of 32 directions.
+const DIRECTIONS_MIN: u32 = 24;
 /// Refit after this many new views.
 const REFIT_VIEWS: usize = 4;
 /// Views that a pass over the zone gives, before thinning.
@@ -40,8 +40,10 @@ const EDGE_COUNT_MIN: usize = 60;
 #[derive(Clone, Copy)]
 struct Pass {
     view_count: usize,
-    /// Views that showed the blob from nearly all sides: whole, and without dark parts.
-    clear_count: [usize; 2],
+    /// Directions seen so far, as bits, and how often in all: of the whole blob, and of it
+    /// without dark parts.
+    directions: [u32; 2],
+    reach_count: [usize; 2],
     first: BeltPosition,
     last: BeltPosition,
     view_step_mm: f64,
@@ -55,14 +57,14 @@ pub struct Measure {
     zone: BeltRect,
     height_max_mm: f64,
     views_per_track: usize,
-    views: Block<View>,
+    views: Block<PassView>,
     passes: Block<Pass>,
 }
 
 impl Measure {
     /// Memory for `tracks_max` passes.
     pub fn plan(tracks_max: usize, views_per_track: usize, plan: &mut Plan) {
-        plan.add::<View>(
+        plan.add::<PassView>(
             "measure.views",
             tracks_max * views_per_track,
             "limits.tracks_max x limits.views_per_track_max",
@@ -80,7 +82,8 @@ impl Measure {
     ) -> Result<Self> {
         let empty = Pass {
             view_count: 0,
-            clear_count: [0; 2],
+            directions: [0; 2],
+            reach_count: [0; 2],
             first: BeltPosition::default(),
             last: BeltPosition::default(),
             view_step_mm: 0.0,
@@ -92,7 +95,7 @@ impl Measure {
             zone,
             height_max_mm,
             views_per_track,
-            views: memory.take("measure.views", View::EMPTY)?,
+            views: memory.take("measure.views", PassView::EMPTY)?,
             passes: memory.take("measure.passes", empty)?,
         })
     }
@@ -101,7 +104,8 @@ impl Measure {
     pub fn begin(&mut self, slot: usize, at: BeltPosition) {
         self.passes[slot] = Pass {
             view_count: 0,
-            clear_count: [0; 2],
+            directions: [0; 2],
+            reach_count: [0; 2],
             first: at,
             last: BeltPosition { travel_mm: f64::NEG_INFINITY, ..at },
             view_step_mm: self.zone.length_mm() / VIEWS_PER_ZONE,
@@ -122,7 +126,7 @@ impl Measure {
         if at.travel_mm - pass.last.travel_mm < pass.view_step_mm {
             return;
         }
-        let mut view = View::EMPTY;
+        let mut view = PassView::EMPTY;
         view.travel_mm = at.travel_mm;
         view.reach_mm = frame.reach(runs);
         if let Some(estimate) = &pass.estimate {
@@ -135,8 +139,9 @@ impl Measure {
         }
         pass.last = at;
         pass.since_fit += 1;
-        for (clear, reach) in pass.clear_count.iter_mut().zip(reach_count) {
-            *clear += usize::from(reach >= REACH_COUNT_MIN);
+        for silhouette in 0..2 {
+            pass.directions[silhouette] |= view.directions()[silhouette];
+            pass.reach_count[silhouette] += reach_count[silhouette];
         }
         let views = &mut self.views[slot * self.views_per_track..][..self.views_per_track];
         if pass.view_count == views.len() {
@@ -158,15 +163,17 @@ impl Measure {
         let travelled = pass.last.travel_mm - pass.first.travel_mm;
         let ready = match pass.estimate {
             None => {
-                let clear = pass.clear_count[0].max(pass.clear_count[1]);
-                clear >= FIRST_FIT_VIEWS && travelled >= FIRST_FIT_TRAVEL_MM
+                let seen = pass.directions.map(u32::count_ones);
+                pass.view_count >= FIRST_FIT_VIEWS
+                    && seen[0].max(seen[1]) >= DIRECTIONS_MIN
+                    && travelled >= FIRST_FIT_TRAVEL_MM
             }
             Some(_) => pass.since_fit >= REFIT_VIEWS,
         };
         if ready {
             let start = pass.estimate.map(|e| e.params);
             // A shadow that runs out of sight leaves the whole blob without an end.
-            let [whole, bright] = pass.clear_count;
+            let [whole, bright] = pass.reach_count;
             let silhouette =
                 if 2 * whole >= bright { Silhouette::Whole } else { Silhouette::Bright };
             let estimate = self.problem(slot, silhouette).fit_reach(self.views(slot), start);
@@ -176,7 +183,7 @@ impl Measure {
         }
     }
 
-    fn views(&self, slot: usize) -> &[View] {
+    fn views(&self, slot: usize) -> &[PassView] {
         &self.views[slot * self.views_per_track..][..self.passes[slot].view_count]
     }
 
@@ -242,17 +249,19 @@ mod tests {
     }
 
     /// Views of a pass of `truth` over the zone, X at the middle of the pass.
-    fn pass(truth: &Params, distort: impl Fn(usize) -> f32) -> Vec<View> {
+    fn pass(truth: &Params, distort: impl Fn(usize) -> f32) -> Vec<PassView> {
         let travels = (-20..=20).map(|i| f64::from(i) * 25.0);
         travels
             .enumerate()
             .map(|(n, travel)| {
-                View::of(&Outline::new(&geometry(), truth, travel), travel, |i| distort(n * 64 + i))
+                PassView::of(&Outline::new(&geometry(), truth, travel), travel, |i| {
+                    distort(n * 64 + i)
+                })
             })
             .collect()
     }
 
-    fn fit(views: &[View], travel_sigma: f64) -> Option<Estimate> {
+    fn fit(views: &[PassView], travel_sigma: f64) -> Option<Estimate> {
         let geometry = geometry();
         let problem = Problem {
             geometry: &geometry,
@@ -353,7 +362,7 @@ mod tests {
     #[test]
     fn no_views_or_views_that_show_nothing_give_no_estimate() {
         assert!(fit(&[], 3e-4).is_none());
-        assert!(fit(&vec![View::EMPTY; 5], 3e-4).is_none());
+        assert!(fit(&vec![PassView::EMPTY; 5], 3e-4).is_none());
     }
 
     #[test]

@@ -109,7 +109,7 @@ impl Outline {
             if top {
                 jacobian *= m;
                 jacobian.set_column(HEIGHT, &((over_belt - view.nadir) * m_by_height));
-                image = view.nadir + (over_belt - view.nadir) * m;
+                image = view.project(over_belt, params[HEIGHT]);
             }
             Vertex { over_belt, image, jacobian }
         };

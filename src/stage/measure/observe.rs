@@ -3,7 +3,7 @@
 use super::model::{DIRECTIONS, EDGES, EdgeId, Outline, direction};
 use crate::camera::BeltView;
 use crate::image::Plane;
-use crate::kernel::scalar::bits::words;
+use crate::kernel::scalar::bits::{self, words};
 use crate::kernel::scalar::profile::{Step, sample, steps};
 use crate::kernel::scalar::runs::Run;
 use crate::units::{BeltMm, BeltPx, BeltRect};
@@ -42,7 +42,7 @@ const NO_SAMPLE: EdgeSample = EdgeSample {
 
 /// One frame's share of a pass.
 #[derive(Clone, Copy, Debug)]
-pub struct View {
+pub struct PassView {
     /// Belt travel since start, mm.
     pub travel_mm: f64,
     /// Reach of the blob in each direction, mm on the belt plane; NaN where not seen. First of
@@ -53,7 +53,7 @@ pub struct View {
     sample_count: u8,
 }
 
-impl View {
+impl PassView {
     /// Nothing seen.
     pub const EMPTY: Self = Self {
         travel_mm: 0.0,
@@ -67,9 +67,15 @@ impl View {
         &self.samples[..usize::from(self.sample_count)]
     }
 
+    /// Which directions were seen, as bits, for both silhouettes.
+    pub fn directions(&self) -> [u32; 2] {
+        let bit = |(k, reach): (usize, &f32)| u32::from(reach.is_finite()) << k;
+        self.reach_mm.map(|reach| reach.iter().enumerate().map(bit).sum())
+    }
+
     /// How many directions were seen, for both silhouettes.
     pub fn reach_count(&self) -> [usize; 2] {
-        self.reach_mm.map(|reach| reach.iter().filter(|r| r.is_finite()).count())
+        self.directions().map(|seen| seen.count_ones() as usize)
     }
 }
 
@@ -143,7 +149,7 @@ impl Frame<'_> {
     /// A run between its first and last stretch of three pixels that are not dark.
     fn without_dark_ends(&self, run: &Run) -> Option<(u16, u16)> {
         let row = &self.dark[usize::from(run.v) * words(self.view.size_px[0])..];
-        let bright = |u: u16| row[usize::from(u) / 64] >> (u % 64) & 1 == 0;
+        let bright = |u: u16| !bits::get(row, usize::from(u));
         let stretch = |u: &u16| (*u..*u + 3).all(bright);
         let mut places = run.start..run.end.saturating_sub(2);
         let first = places.find(stretch)?;
@@ -158,8 +164,7 @@ impl Frame<'_> {
         let (u, v) = (px.u as usize, px.v as usize);
         let inside =
             (2..width.saturating_sub(2)).contains(&u) && (2..height.saturating_sub(2)).contains(&v);
-        let is_seen =
-            |u: usize, v: usize| self.seen[v * words(width) + u / 64] >> (u % 64) & 1 == 1;
+        let is_seen = |u: usize, v: usize| bits::get(&self.seen[v * words(width)..], u);
         in_zone
             && inside
             && [(u - 2, v), (u + 2, v), (u, v - 2), (u, v + 2)]
@@ -168,15 +173,14 @@ impl Frame<'_> {
     }
 
     /// Take profiles across the visible edges of a predicted outline.
-    pub fn sample_edges(&self, outline: &Outline, into: &mut View) {
+    pub fn sample_edges(&self, outline: &Outline, into: &mut PassView) {
         let mut count = 0;
         for edge in (0..EDGES as u8).map(EdgeId).filter(|&e| outline.visible(e)) {
             let ends = outline.ends(edge);
             for i in 0..SAMPLES_PER_EDGE {
                 let t = (i as f64 + 0.5) / SAMPLES_PER_EDGE as f64;
-                let over_belt_x =
-                    ends[0].over_belt.x + t * (ends[1].over_belt.x - ends[0].over_belt.x);
-                if !(self.zone.x_min_mm..=self.zone.x_max_mm).contains(&over_belt_x) {
+                let over_belt = ends[0].over_belt + (ends[1].over_belt - ends[0].over_belt) * t;
+                if !self.zone.contains(over_belt.x, over_belt.y) {
                     continue;
                 }
                 let anchor = ends[0].image + (ends[1].image - ends[0].image) * t;
@@ -220,7 +224,7 @@ impl Frame<'_> {
 }
 
 #[cfg(test)]
-impl View {
+impl PassView {
     /// What a perfect camera sees of a cuboid; `distort` moves each step, mm, by sample index.
     pub(super) fn of(
         outline: &Outline,
