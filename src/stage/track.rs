@@ -230,10 +230,9 @@ impl Tracker {
         let hidden_by = blobs.iter().filter(hides).max_by(|a, b| overlap(a).total_cmp(&overlap(b)));
         let Some(blob) = hidden_by else { return };
         let owner = usize::from(self.owners[blob.label as usize]);
-        let inside = covers(owner, &bounds).unwrap_or_else(|| {
-            let whole = self.tracks[owner].bounds.union(&blob.bounds);
-            whole.overlap(&bounds) >= INSIDE_SHARE * bounds.area()
-        });
+        let whole = self.tracks[owner].bounds.union(&blob.bounds);
+        let inside = covers(owner, &bounds) == Some(true)
+            || whole.overlap(&bounds) >= INSIDE_SHARE * bounds.area();
         let track = &mut self.tracks[slot];
         track.inside_frames = if inside { track.inside_frames + 1 } else { 0 };
         let young = track.frames < YOUNG_FRAMES && track.phase == Phase::Candidate;
