@@ -27,17 +27,29 @@ impl Flags {
     /// Too few edges were found: size from the silhouette alone.
     pub const SILHOUETTE_ONLY: Self = Self(1 << 6);
 
-    /// Every flag with its name in records, in bit order.
-    pub const NAMES: [(Self, &'static str); 9] = [
-        (Self::UNFINISHED, "unfinished"),
-        (Self::MERGED, "merged"),
-        (Self::CLIPPED, "clipped"),
-        (Self::HEIGHT_UNCERTAIN, "height_uncertain"),
-        (Self::SPEED_ASSUMED, "speed_assumed"),
-        (Self::LOST, "lost"),
-        (Self::SILHOUETTE_ONLY, "silhouette_only"),
-        (Self::TOO_TALL, "too_tall"),
-        (Self::FOOTPRINT_UNCERTAIN, "footprint_uncertain"),
+    /// Every flag: its name in records and its meaning, in bit order.
+    pub const ALL: [(Self, &'static str, &'static str); 9] = [
+        (Self::UNFINISHED, "unfinished", "still inside when the input ended"),
+        (Self::MERGED, "merged", "its image ran together with a neighbour's for some of the pass"),
+        (
+            Self::CLIPPED,
+            "clipped",
+            "it reached over the side of the zone; parts outside are not used",
+        ),
+        (Self::HEIGHT_UNCERTAIN, "height_uncertain", "standard deviation of the height above 3 mm"),
+        (Self::SPEED_ASSUMED, "speed_assumed", "belt speed assumed, not measured: trust no height"),
+        (Self::LOST, "lost", "it vanished inside the zone"),
+        (
+            Self::SILHOUETTE_ONLY,
+            "silhouette_only",
+            "too few edges: a rough size, trust no dimension",
+        ),
+        (Self::TOO_TALL, "too_tall", "taller than view.height_max_mm: trust no dimension"),
+        (
+            Self::FOOTPRINT_UNCERTAIN,
+            "footprint_uncertain",
+            "standard deviation of length or width above 3 mm",
+        ),
     ];
 
     /// Add `flag` when `condition` holds.
@@ -61,7 +73,7 @@ impl Flags {
 impl fmt::Display for Flags {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         let mut names =
-            Self::NAMES.iter().filter(|(flag, _)| self.has(*flag)).map(|(_, name)| name);
+            Self::ALL.iter().filter(|(flag, ..)| self.has(*flag)).map(|(_, name, _)| name);
         match names.next() {
             Some(first) => write!(f, "{first}")?,
             None => return Ok(()),
@@ -73,7 +85,7 @@ impl fmt::Display for Flags {
 impl serde::Serialize for Flags {
     fn serialize<S: Serializer>(&self, serializer: S) -> Result<S::Ok, S::Error> {
         let mut seq = serializer.serialize_seq(None)?;
-        for (_, name) in Self::NAMES.iter().filter(|(flag, _)| self.has(*flag)) {
+        for (_, name, _) in Self::ALL.iter().filter(|(flag, ..)| self.has(*flag)) {
             seq.serialize_element(name)?;
         }
         seq.end()
@@ -124,6 +136,8 @@ pub struct ParcelRecord {
     pub shape: Shape,
     /// Doubts.
     pub flags: Flags,
+    /// Belt travel since start at `frame`: where the parcel is later, follows from it.
+    pub belt_travel_mm: f64,
 }
 
 impl ParcelRecord {
@@ -146,6 +160,7 @@ impl ParcelRecord {
             &mut self.sigma_width_mm,
             &mut self.sigma_height_mm,
             &mut self.belt_speed_mm_per_s,
+            &mut self.belt_travel_mm,
         ] {
             round(value, 100.0);
         }

@@ -1,13 +1,13 @@
 //! Command line only: arguments in, exit status out.
 
 use beltgauge::config::Site;
-use beltgauge::error::Result;
+use beltgauge::error::{Error, Result};
 use beltgauge::event::ParcelRecord;
 use beltgauge::run::demo;
 use beltgauge::run::offline::{self, Observer, Outputs};
 use beltgauge::{run, source};
 use clap::{Parser, Subcommand};
-use std::io::IsTerminal;
+use std::io::{IsTerminal, Write};
 use std::net::SocketAddr;
 use std::path::PathBuf;
 use std::process::ExitCode;
@@ -68,10 +68,16 @@ fn main() -> ExitCode {
     match dispatch(Cli::parse().command) {
         Ok(()) => ExitCode::SUCCESS,
         Err(error) => {
-            eprintln!("error: {error}");
+            let _ = writeln!(std::io::stderr(), "error: {error}");
             ExitCode::from(error.exit_status())
         }
     }
+}
+
+/// A line on standard output.
+fn print(line: std::fmt::Arguments<'_>) -> Result<()> {
+    writeln!(std::io::stdout(), "{line}")
+        .map_err(|e| Error::failure(format!("cannot write to standard output: {e}")))
 }
 
 /// Records on standard output, progress on a terminal's standard error.
@@ -80,15 +86,16 @@ struct Console;
 impl Observer for Console {
     fn frame(&mut self, index: u64) {
         if index.is_multiple_of(20) && std::io::stderr().is_terminal() {
-            eprint!("\rframe {index} ");
+            let _ = write!(std::io::stderr(), "\rframe {index} ");
         }
     }
 
     fn record(&mut self, record: &ParcelRecord) {
         if std::io::stderr().is_terminal() {
-            eprint!("\r");
+            let _ = write!(std::io::stderr(), "\r");
         }
-        println!("{record}");
+        // The record file goes on when nobody reads the table any more.
+        let _ = writeln!(std::io::stdout(), "{record}");
     }
 }
 
@@ -96,23 +103,22 @@ fn dispatch(command: Command) -> Result<()> {
     match command {
         Command::Demo { seconds, out, listen } => {
             let table = demo::run(demo::Options { seconds, out: &out, listen })?;
-            println!("{table}\npictures and records are in {}", out.display());
-            Ok(())
+            print(format_args!("{table}\npictures and records are in {}", out.display()))
         }
         Command::Measure { input, config, fps, jsonl, annotate } => {
             let site = Site::load(&config)?;
             let outputs = Outputs { jsonl: jsonl.as_deref(), annotate: annotate.as_deref() };
             let source = source::open(&input, fps)?;
-            println!("{}", ParcelRecord::TABLE_HEADER);
+            print(format_args!("{}", ParcelRecord::TABLE_HEADER))?;
             let counters = offline::measure(source, site, outputs, &mut Console)?;
-            println!("{counters}");
-            Ok(())
+            print(format_args!("{counters}"))
         }
         Command::Check { config } => {
             let site = Site::load(&config)?;
             let plan = run::plan(&site);
-            println!("{plan}");
-            plan.check_limit(site.config.limits.memory_mib_max)
+            print(format_args!("{plan}"))?;
+            plan.check_limit(site.config.limits.memory_mib_max)?;
+            print(format_args!("the configuration is valid"))
         }
     }
 }

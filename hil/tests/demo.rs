@@ -6,7 +6,7 @@ use hil::{Demo, wait_for};
 const PEAK_MIB_MAX: f64 = 100.0;
 
 #[test]
-fn the_demo_fits_one_processor_and_a_hundred_megabytes() {
+fn the_demo_stays_below_a_hundred_megabytes_and_draws_every_parcel() {
     let seconds = 20;
     let demo = Demo::start("demo", seconds, true);
     let (mut peak_mib, mut ticks) = (0.0f64, 0);

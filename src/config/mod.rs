@@ -110,8 +110,10 @@ fn check_zone_in_view(camera: &Camera, zone: &BeltRect) -> Result<()> {
             BeltMm { x: from.x + t * (to.x - from.x), y: from.y + t * (to.y - from.y) }
         })
     };
+    // Corners first: their numbers are those of the file.
+    let corners = [a, b, c, d].into_iter();
     let sides = along(a, b).chain(along(b, c)).chain(along(c, d)).chain(along(d, a));
-    for corner in sides {
+    for corner in corners.chain(sides) {
         let raw = camera.project(Vector3::new(corner.x, corner.y, 0.0));
         if raw.is_some_and(|px| camera.sees(px)) {
             continue;

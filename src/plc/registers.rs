@@ -67,6 +67,10 @@ pub struct Status {
     pub source_ended: bool,
     /// Belt speed.
     pub belt_speed_mm_per_s: f64,
+    /// Time of the newest frame since start.
+    pub time_s: f64,
+    /// Belt travel since start.
+    pub belt_travel_mm: f64,
     /// Frames that came too late and were dropped.
     pub frames_dropped: u64,
     /// What the pipeline counts.
@@ -100,7 +104,7 @@ pub const STATUS_FIELDS: &[StatusField] = fields![
     [4, "test_i16", I16, "", 1.0, "constant -12345: checks the sign", |_| -12345.0],
     [10, "heartbeat", U16, "", 1.0, "rises ten times a second while frames arrive; wraps", |s| f64::from(s.heartbeat)],
     [11, "status", U16, "bits", 1.0, "bit 0 running, bit 1 ready (belt learned), bit 2 belt motion measured", |s| f64::from(u16::from(s.running) | u16::from(s.ready) << 1 | u16::from(s.belt_measured) << 2)],
-    [12, "fault", U16, "bits", 1.0, "bit 0 frame source ended, bit 1 a table or queue was full (see counters)", |s| f64::from(u16::from(s.source_ended) | u16::from(s.counters.segment_overflows + s.counters.track_overflows + s.counters.event_overflows > 0) << 1)],
+    [12, "fault", U16, "bits", 1.0, "bit 0 frame source ended, bit 1 a table or queue has been full since start (see counters)", |s| f64::from(u16::from(s.source_ended) | u16::from(s.counters.segment_overflows + s.counters.track_overflows + s.counters.event_overflows > 0) << 1)],
     [13, "belt_speed", U32, "mm/s", 10.0, "belt speed", |s| s.belt_speed_mm_per_s],
     [15, "frames", U32, "", 1.0, "frames processed; wraps", |s| wrapped(s.counters.frames)],
     [17, "frames_dropped", U32, "", 1.0, "frames that came too late; wraps", |s| wrapped(s.frames_dropped)],
@@ -110,6 +114,8 @@ pub const STATUS_FIELDS: &[StatusField] = fields![
     [25, "segment_overflows", U32, "", 1.0, "frames with more runs or blobs than the tables hold", |s| wrapped(s.counters.segment_overflows)],
     [27, "track_overflows", U32, "", 1.0, "blobs that found no free track", |s| wrapped(s.counters.track_overflows)],
     [29, "event_overflows", U32, "", 1.0, "records that found the queue to the PLC full", |s| wrapped(s.counters.event_overflows)],
+    [31, "time", U32, "ms", 1.0, "time of the newest frame since start; wraps", |s| wrapped((s.time_s * 1000.0) as u64)],
+    [33, "belt_travel", U32, "mm", 10.0, "belt travel since start; wraps after 429 km", |s| s.belt_travel_mm],
 ];
 
 /// Quality 0 to 100 of a dimension: 100 at sigma 0, 0 from 5 mm on.
@@ -121,7 +127,7 @@ fn quality(sigma_mm: f64) -> f64 {
 #[rustfmt::skip]
 pub const PARCEL_FIELDS: &[ParcelField] = fields![
     [0, "sequence", U32, "", 1.0, "from 1; 0 = no parcel yet", |p| f64::from(p.seq)],
-    [2, "valid", U16, "bits", 1.0, "bit 0 the block holds a parcel, bit 1 its shape is a box", |p| f64::from(1 | u16::from(p.shape == Shape::Box) << 1)],
+    [2, "valid", U16, "bits", 1.0, "bit 0 the block holds a parcel, bit 1 its shape is a box (else: no cuboid, its height cannot be trusted)", |p| f64::from(1 | u16::from(p.shape == Shape::Box) << 1)],
     [3, "flags", U16, "bits", 1.0, "doubts, see below", |p| f64::from(p.flags.bits())],
     [4, "length", U16, "mm", 10.0, "longer side of the footprint", |p| p.length_mm],
     [5, "width", U16, "mm", 10.0, "shorter side of the footprint", |p| p.width_mm],
@@ -138,6 +144,7 @@ pub const PARCEL_FIELDS: &[ParcelField] = fields![
     [18, "belt_speed", U32, "mm/s", 10.0, "mean over the pass", |p| p.belt_speed_mm_per_s],
     [20, "frame", U32, "", 1.0, "frame at which x and y hold; wraps", |p| wrapped(p.frame)],
     [22, "time", U32, "ms", 1.0, "time of that frame since start; wraps", |p| wrapped((p.t_s * 1000.0).round() as u64)],
+    [24, "belt_travel", U32, "mm", 10.0, "belt travel since start at that frame", |p| p.belt_travel_mm],
     [30, "sequence_end", U32, "", 1.0, "equals sequence unless the block changed between two requests", |p| f64::from(p.seq)],
 ];
 
@@ -216,7 +223,10 @@ pub fn document() -> String {
         "Map version {}.{}. Modbus TCP, any unit identifier. Function codes 3 (holding) and 4 (input)\n\
          read the same {COUNT} registers, at most 125 at once; every write is refused with exception 1.\n\
          Addresses start at 0: decimal address 100 is 0x0064, holding register 40101 in the old notation.\n\
-         Two-register values have the high word first. Value = register / scale, in the unit given.\n",
+         Two-register values have the high word first. Value = register / scale, in the unit given; what\n\
+         does not fit shows the end of the range. Addresses not listed read 0; beyond the map: exception 2.\n\
+         Poll as fast as you like (10 to 50 ms is usual); a client silent for a minute is disconnected\n\
+         (`modbus.idle_timeout_s`). A restart clears everything: sequence, ring, time and travel begin anew.\n",
         MAP_VERSION >> 8,
         MAP_VERSION & 0xff,
     );
@@ -227,12 +237,14 @@ pub fn document() -> String {
         "\n## Latest parcel, from address {LATEST}; ring of the last {RING_PARCELS}, from address {RING}\n\n\
          A parcel takes {PARCEL_STRIDE} registers. Parcel `n` is at {RING} + {PARCEL_STRIDE} * ((n - 1) mod {RING_PARCELS}).\n\
          A block read in one request is never torn; read in several, it is whole when `sequence` and\n\
-         `sequence_end` are equal. Addresses below are of the latest parcel.\n"
+         `sequence_end` are equal. A parcel without a size gets no sequence number; `parcels_unmeasured`\n\
+         counts it. Where a parcel is now: x + status `belt_travel` - its own `belt_travel`.\n\
+         Addresses below are of the latest parcel.\n"
     );
     table(&mut text, PARCEL_FIELDS, LATEST);
-    text.push_str("\n## Flags of a parcel\n\n| bit | flag |\n|---|---|\n");
-    for (flag, name) in Flags::NAMES {
-        let _ = writeln!(text, "| {} | {name} |", flag.bits().trailing_zeros());
+    text.push_str("\n## Flags of a parcel\n\n| bit | flag | meaning |\n|---|---|---|\n");
+    for (flag, name, meaning) in Flags::ALL {
+        let _ = writeln!(text, "| {} | {name} | {meaning} |", flag.bits().trailing_zeros());
     }
     text
 }
@@ -275,6 +287,7 @@ mod tests {
             belt_speed_mm_per_s: 500.3,
             shape: Shape::Box,
             flags: Flags::default(),
+            belt_travel_mm: 1712.5,
         }
     }
 
@@ -302,7 +315,7 @@ mod tests {
         assert_eq!(latest[..8], [1, 4464, 3, 0, 2351, 1248, 702, (-1240i16) as u16]);
         assert_eq!(latest[8..12], [0, 610, 0xffff, (-403i16) as u16]);
         assert_eq!(latest[12..18], [30, 25, 750, 94, 95, 0]);
-        assert_eq!(latest[18..24], [0, 5003, 0, 137, 0, 3425]);
+        assert_eq!(latest[18..26], [0, 5003, 0, 137, 0, 3425, 0, 17125]);
         assert_eq!(latest[30..], [1, 4464]);
     }
 

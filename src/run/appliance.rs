@@ -66,6 +66,7 @@ pub struct Appliance {
 struct Shared {
     stop: AtomicBool,
     source_ended: AtomicBool,
+    vision_ended: AtomicBool,
     frames_dropped: AtomicU64,
     progress: Mutex<Progress>,
 }
@@ -97,6 +98,7 @@ impl Appliance {
         source: &mut dyn FrameSource,
         mut observe: impl FnMut(&Progress, &mut dyn Iterator<Item = ParcelRecord>) -> bool,
     ) -> Result<Progress> {
+        self.site.check_image_size(source.size_px())?;
         let modbus_settings = self.site.config.modbus.clone();
         let (pace, listener) = (self.pace, self.listener);
         let (buffers, pipeline) = super::memory::build(self.site)?;
@@ -114,13 +116,10 @@ impl Appliance {
         }
         std::thread::scope(|scope| {
             let shared = &shared;
-            let vision = Vision {
-                pipeline,
-                ready: ready_out,
-                free: free_in,
-                records: [plc_in, observer_in],
-                shared,
-            };
+            // However this closure is left, the threads must end, or the scope waits for ever.
+            let _stop = StopOnDrop(shared);
+            let records = [plc_in, observer_in];
+            let vision = Vision { pipeline, ready: ready_out, free: free_in, records, shared };
             let vision = spawn(scope, "vision", move || vision.run())?;
             let waker = vision.thread().clone();
             let capture = Capture { source, pace, free: free_out, ready: ready_in, shared, waker };
@@ -128,28 +127,42 @@ impl Appliance {
             let plc = spawn(scope, "plc", move || {
                 let mut heartbeat = Heartbeat::new();
                 modbus::serve(listener, &modbus_settings, |publish| {
+                    // Asked before the ring is emptied: what came before the end is published.
+                    let ended = shared.vision_ended.load(Ordering::Acquire);
                     while let Some(record) = plc_out.dequeue() {
                         publish(&record);
                     }
                     let mut status = shared.progress().status;
                     heartbeat.update(&mut status);
-                    (!shared.stopped()).then_some(status)
+                    (!ended).then_some(status)
                 })
             })?;
-            while !capture.is_finished() && !plc.is_finished() {
+            while !(capture.is_finished() || vision.is_finished() || plc.is_finished()) {
                 std::thread::park_timeout(PARK);
                 let mut records = std::iter::from_fn(|| observer_out.dequeue());
                 if !observe(&shared.progress(), &mut records) {
                     break;
                 }
             }
-            shared.source_ended.store(true, Ordering::Relaxed);
-            let captured = join(capture, || shared.stop.store(true, Ordering::Relaxed));
-            let seen = join(vision, || {});
+            // In the order of the flow, so that every frame and record arrives.
+            shared.stop.store(true, Ordering::Relaxed);
+            let captured = join(capture);
+            let seen = join(vision);
+            let served = join(plc);
             observe(&shared.progress(), &mut std::iter::from_fn(|| observer_out.dequeue()));
-            let served = join(plc, || {});
             captured.and(seen).and(served).map(|()| shared.progress())
         })
+    }
+}
+
+/// Lets every thread end.
+struct StopOnDrop<'a>(&'a Shared);
+
+impl Drop for StopOnDrop<'_> {
+    fn drop(&mut self) {
+        self.0.stop.store(true, Ordering::Relaxed);
+        self.0.source_ended.store(true, Ordering::Release);
+        self.0.vision_ended.store(true, Ordering::Release);
     }
 }
 
@@ -166,9 +179,8 @@ fn spawn<'scope, 'env>(
         .map_err(|e| Error::failure(format!("cannot start the {name} thread: {e}")))
 }
 
-/// Wait for a thread after asking it to end; a panic in it is a broken invariant.
-fn join(handle: Handle<'_>, ask: impl FnOnce()) -> Result<()> {
-    ask();
+/// Wait for a thread; a panic in it is a broken invariant and goes on here.
+fn join(handle: Handle<'_>) -> Result<()> {
     handle.join().unwrap_or_else(|panic| std::panic::resume_unwind(panic))
 }
 
@@ -185,7 +197,7 @@ struct Capture<'a> {
 impl Capture<'_> {
     fn run(mut self) -> Result<()> {
         let result = self.frames();
-        self.shared.source_ended.store(true, Ordering::Relaxed);
+        self.shared.source_ended.store(true, Ordering::Release);
         self.waker.unpark();
         result
     }
@@ -247,11 +259,18 @@ struct Vision<'a> {
 
 impl Vision<'_> {
     fn run(mut self) -> Result<()> {
+        let result = self.frames();
+        self.shared.vision_ended.store(true, Ordering::Release);
+        result
+    }
+
+    fn frames(&mut self) -> Result<()> {
         let [width, height] = self.pipeline.site().camera.image_size_px;
         let mut overflows = 0;
         loop {
             let Some(frame) = self.ready.dequeue() else {
-                if self.shared.source_ended.load(Ordering::Relaxed) && self.ready.is_empty() {
+                // Asked before the ring: what was captured before the end is processed.
+                if self.shared.source_ended.load(Ordering::Acquire) && self.ready.is_empty() {
                     return Ok(());
                 }
                 std::thread::park_timeout(PARK);
@@ -262,25 +281,28 @@ impl Vision<'_> {
                 .ok_or_else(|| Error::failure("a frame of another size"))?;
             let records = &mut self.records;
             self.pipeline.step(raw, frame.time, &mut |record| {
-                for ring in records.iter_mut() {
-                    overflows += u64::from(ring.enqueue(record).is_err());
-                }
+                let [plc, observer] = records;
+                overflows += u64::from(plc.enqueue(record).is_err());
+                // An observer that does not look misses records; the PLC never does.
+                let _ = observer.enqueue(record);
             })?;
-            self.publish(began.elapsed(), overflows);
+            self.publish(frame.time.t_s, began.elapsed(), overflows);
             let _ = self.free.enqueue(frame.pixels);
         }
     }
 
-    fn publish(&self, frame_time: Duration, overflows: u64) {
+    fn publish(&self, time_s: f64, frame_time: Duration, overflows: u64) {
         let (speed, measured) = self.pipeline.belt_motion();
-        let mut progress =
-            self.shared.progress.lock().unwrap_or_else(std::sync::PoisonError::into_inner);
+        // Never waits: while a reader holds the lock, it sees the frame before.
+        let Ok(mut progress) = self.shared.progress.try_lock() else { return };
         let status = &mut progress.status;
         status.counters = self.pipeline.counters();
         status.counters.event_overflows = overflows;
         status.ready = self.pipeline.ready();
         status.belt_speed_mm_per_s = speed.max(0.0);
         status.belt_measured = measured;
+        status.belt_travel_mm = self.pipeline.belt_position().travel_mm;
+        status.time_s = time_s;
         progress.frame_time_max = progress.frame_time_max.max(frame_time);
     }
 }

@@ -59,7 +59,12 @@ pub fn run(options: Options<'_>) -> Result<String> {
         Error::failure(format!("cannot write the results: {e}")).in_file(options.out)
     };
     std::fs::create_dir_all(options.out).map_err(failed)?;
-    eprintln!("rendering the belt; Modbus TCP on {listen}, registers as in config/REGISTERS.md");
+    let records_path = options.out.join("parcels.jsonl");
+    std::fs::write(&records_path, "").map_err(failed)?; // found out now, not at the end
+    let _ = writeln!(
+        std::io::stderr(),
+        "rendering the belt; Modbus TCP on {listen}, registers as in config/REGISTERS.md"
+    );
     let mut source = Synthetic::new(scenario)?;
     let appliance = Appliance::new(site, Pace::RealTime)?;
     let mut records: Vec<ParcelRecord> = Vec::new();
@@ -72,13 +77,13 @@ pub fn run(options: Options<'_>) -> Result<String> {
         }
         start.elapsed().as_secs_f64() < options.seconds
     })?;
-    eprintln!();
+    let _ = writeln!(std::io::stderr());
     let mut lines = Vec::new();
     for record in &records {
         serde_json::to_writer(&mut lines, record).map_err(|e| failed(e.into()))?;
         lines.push(b'\n');
     }
-    std::fs::write(options.out.join("parcels.jsonl"), lines).map_err(failed)?;
+    std::fs::write(&records_path, lines).map_err(failed)?;
     let [width, height] = source.size_px();
     let mut frame = vec![0; width * height];
     for record in &records {
@@ -108,8 +113,9 @@ fn console(progress: &Progress, elapsed: Duration, last: Option<&ParcelRecord>) 
         if status.belt_measured { "" } else { " (assumed)" },
         status.counters.parcels,
     );
-    eprint!("\r{line:100}");
-    let _ = std::io::stderr().flush();
+    // Nobody need be listening.
+    let mut console = std::io::stderr();
+    let _ = write!(console, "\r{line:100}").and_then(|()| console.flush());
 }
 
 /// The parcel of the scenario that a record is of.

@@ -30,7 +30,8 @@ impl Directory {
         for entry in std::fs::read_dir(folder).map_err(unreadable)? {
             let path = entry.map_err(unreadable)?.path();
             let extension = path.extension().and_then(|e| e.to_str()).map(str::to_ascii_lowercase);
-            if extension.is_some_and(|e| EXTENSIONS.contains(&e.as_str())) {
+            let is_image = extension.is_some_and(|e| EXTENSIONS.contains(&e.as_str()));
+            if is_image && path.is_file() {
                 files.push(path);
             }
         }
@@ -40,7 +41,10 @@ impl Directory {
                 .in_file(folder)
                 .allowed("*.png, *.pgm, *.jpg, *.jpeg")
         })?;
-        let (width, height) = image::image_dimensions(first)
+        let (width, height) = image::ImageReader::open(first)
+            .and_then(image::ImageReader::with_guessed_format)
+            .map_err(image::ImageError::IoError)
+            .and_then(image::ImageReader::into_dimensions)
             .map_err(|e| Error::failure(format!("unreadable image: {e}")).in_file(first))?;
         Ok(Self {
             files: files.into_iter(),

@@ -237,7 +237,9 @@ impl Tracker {
         track.inside_frames = if inside { track.inside_frames + 1 } else { 0 };
         let young = track.frames < YOUNG_FRAMES && track.phase == Phase::Candidate;
         if young || track.inside_frames >= FRAGMENT_FRAMES {
+            // What looked like two parcels was one.
             track.phase = Phase::Free;
+            self.tracks[owner].merged_frames = 0;
         } else {
             track.merged = true;
             self.tracks[owner].merged |= !inside;

@@ -139,9 +139,9 @@ impl Measure {
         }
         pass.last = at;
         pass.since_fit += 1;
-        for silhouette in 0..2 {
-            pass.directions[silhouette] |= view.directions()[silhouette];
-            pass.reach_count[silhouette] += reach_count[silhouette];
+        for (k, (seen, count)) in view.directions().into_iter().zip(reach_count).enumerate() {
+            pass.directions[k] |= seen;
+            pass.reach_count[k] += count;
         }
         let views = &mut self.views[slot * self.views_per_track..][..self.views_per_track];
         if pass.view_count == views.len() {
