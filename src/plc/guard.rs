@@ -43,8 +43,14 @@ fn judge(pdu: &[u8]) -> Verdict {
 }
 
 /// Serve one client until it leaves, is silent for `idle`, or breaks the protocol.
-/// `library` is the other end of what the Modbus library reads and writes.
-pub async fn serve<C, L>(mut client: C, mut library: L, idle: Duration) -> std::io::Result<()>
+/// `library` is the other end of what the Modbus library reads and writes; `note_request` is
+/// told of every whole request.
+pub async fn serve<C, L>(
+    mut client: C,
+    mut library: L,
+    idle: Duration,
+    note_request: impl Fn(),
+) -> std::io::Result<()>
 where
     C: AsyncRead + AsyncWrite + Unpin,
     L: AsyncRead + AsyncWrite + Unpin,
@@ -55,6 +61,7 @@ where
             return Ok(()); // the client has left
         }
         let length = timeout(EXCHANGE_TIMEOUT, read_rest(&mut client, &mut frame, 1)).await??;
+        note_request();
         let answer = match judge(&frame[HEADER_BYTES..length]) {
             Verdict::Forward => {
                 library.write_all(&frame[..length]).await?;
@@ -122,7 +129,7 @@ mod tests {
         runtime.block_on(async {
             let (mut client, guarded) = tokio::io::duplex(1024);
             let (library, _other) = tokio::io::duplex(1024);
-            let guard = tokio::spawn(serve(guarded, library, Duration::from_secs(1)));
+            let guard = tokio::spawn(serve(guarded, library, Duration::from_secs(1), || {}));
             client.write_all(bytes).await.expect("written");
             client.shutdown().await.expect("shut");
             let mut answer = Vec::new();

@@ -1,7 +1,7 @@
 //! Modbus TCP server: `tokio-modbus` behind the guard, reading the register image.
 //!
 //! In: parcel records from a ring, status. Out: registers to any number of clients up to
-//! `modbus.connections_max`. Owns: the register image. Runs on its own thread; nothing here
+//! `modbus.connections_max`, beyond which the one silent for longest is disconnected. Owns: the register image. Runs on its own thread; nothing here
 //! can block the vision thread.
 
 use super::guard;
@@ -11,9 +11,9 @@ use crate::error::{Error, Result};
 use crate::event::ParcelRecord;
 use std::future::{Ready, ready};
 use std::net::{SocketAddr, TcpListener};
-use std::sync::atomic::{AtomicUsize, Ordering};
+use std::sync::atomic::{AtomicU64, Ordering};
 use std::sync::{Arc, Mutex, PoisonError};
-use std::time::Duration;
+use std::time::{Duration, Instant};
 use tokio::io::DuplexStream;
 use tokio::net::TcpStream;
 use tokio_modbus::server::Service;
@@ -76,26 +76,27 @@ pub fn serve(
 /// Accept clients for ever; a failing listener is tried again.
 async fn accept(listener: tokio::net::TcpListener, settings: Settings, image: SharedImage) {
     let server = tokio_modbus::server::tcp::Server::new(listener);
-    let clients = Arc::new(AtomicUsize::new(0));
+    let clients = Mutex::new(Clients { max: settings.connections_max, connected: Vec::new() });
+    let started = Instant::now();
     let on_connected = |stream: TcpStream, address: SocketAddr| {
-        let client = Client::admit(&clients, settings.connections_max);
+        let _ = stream.set_nodelay(true);
         let idle = Duration::from_secs(settings.idle_timeout_s);
         let registers = Registers(Arc::clone(&image));
-        async move {
-            let Some(client) = client else {
-                tracing::warn!(%address, "Modbus client refused: modbus.connections_max reached");
-                return Ok(None);
-            };
+        let (library_end, guard_end) = tokio::io::duplex(PIPE_BYTES);
+        let last_request = Arc::new(AtomicU64::new(0));
+        let seen = Arc::clone(&last_request);
+        let note_request = move || {
+            seen.store(started.elapsed().as_millis() as u64, Ordering::Relaxed);
+        };
+        note_request();
+        let connection = tokio::spawn(async move {
             tracing::info!(%address, "Modbus client connected");
-            let _ = stream.set_nodelay(true);
-            let (library_end, guard_end) = tokio::io::duplex(PIPE_BYTES);
-            tokio::spawn(async move {
-                let reason = guard::serve(stream, guard_end, idle).await;
-                tracing::info!(%address, ?reason, "Modbus client disconnected");
-                drop(client);
-            });
-            Ok(Some((registers, library_end)))
-        }
+            let reason = guard::serve(stream, guard_end, idle, note_request).await;
+            tracing::info!(%address, ?reason, "Modbus client disconnected");
+        });
+        let client = Client { last_request, connection: connection.abort_handle() };
+        clients.lock().unwrap_or_else(PoisonError::into_inner).admit(client);
+        async move { Ok(Some((registers, library_end))) }
     };
     loop {
         let ended: std::io::Result<()> =
@@ -105,20 +106,31 @@ async fn accept(listener: tokio::net::TcpListener, settings: Settings, image: Sh
     }
 }
 
-/// A place among the connections, given back when dropped.
-struct Client(Arc<AtomicUsize>);
-
-impl Client {
-    fn admit(clients: &Arc<AtomicUsize>, max: usize) -> Option<Self> {
-        let admitted = clients
-            .fetch_update(Ordering::Relaxed, Ordering::Relaxed, |n| (n < max).then_some(n + 1));
-        admitted.ok().map(|_| Self(Arc::clone(clients)))
-    }
+/// The connected clients.
+struct Clients {
+    max: usize,
+    connected: Vec<Client>,
 }
 
-impl Drop for Client {
-    fn drop(&mut self) {
-        self.0.fetch_sub(1, Ordering::Relaxed);
+struct Client {
+    /// When it last asked for something, ms since the server started.
+    last_request: Arc<AtomicU64>,
+    connection: tokio::task::AbortHandle,
+}
+
+impl Clients {
+    /// Take a client in. When there are too many, the one silent for longest has to go: a PLC
+    /// that has been restarted must get in, whatever it left half-open before.
+    fn admit(&mut self, client: Client) {
+        self.connected.retain(|c| !c.connection.is_finished());
+        if self.connected.len() >= self.max {
+            let silence = |c: &Client| c.last_request.load(Ordering::Relaxed);
+            let longest = (0..self.connected.len()).min_by_key(|&i| silence(&self.connected[i]));
+            if let Some(i) = longest {
+                self.connected.swap_remove(i).connection.abort();
+            }
+        }
+        self.connected.push(client);
     }
 }
 
