@@ -193,7 +193,7 @@ impl Frame<'_> {
         into.sample_count = count as u8;
     }
 
-    /// One profile; `None` where it leaves the view or finds no step.
+    /// One profile; `None` where it leaves the view.
     fn sample_edge(
         &self,
         edge: EdgeId,
@@ -208,9 +208,8 @@ impl Frame<'_> {
         let mut profile = [0.0; 2 * SEARCH_PX + 1];
         sample(self.grey, start, step, PROFILE_HALF_WIDTH, &mut profile)?;
         let mut found = NO_SAMPLE.steps;
-        if steps(&profile, SLOPE_MIN, &mut found) == 0 {
-            return None;
-        }
+        // A profile without a step counts: it shows that no edge is here.
+        steps(&profile, SLOPE_MIN, &mut found);
         for step in found.iter_mut().filter(|s| s.slope != 0.0) {
             step.at = (step.at - SEARCH_PX as f32) * self.view.mm_per_px as f32;
         }
