@@ -26,7 +26,7 @@ const BOX_EDGE_SHARE_MIN: f64 = 0.5;
 const SIGMA_MAX_MM: f64 = 3.0;
 /// Above this relative sigma the belt speed counts as assumed.
 const SPEED_SIGMA_MAX: f64 = 0.01;
-/// Around a parcel this many px are not learned as background: the next frame's parcel.
+/// Around a parcel this many px are not learned as background: its blurred border.
 const HOLD_MARGIN_PX: usize = 2;
 /// Around a parcel this many px are no witness of the belt's motion: blur and compression
 /// carry the parcel's own, faster motion into them.

@@ -137,6 +137,24 @@ fn a_camera_below_the_belt_is_refused() {
 }
 
 #[test]
+fn an_absurd_lens_is_refused_or_survived() {
+    for distortion in
+        ["[0, 0, 0, 1.2346, 0]", "[0, 0, 1.5, 0, 0]", "[0, 0, -1.2, 1.2, 0]", "[9, -9, 0, 0, 9]"]
+    {
+        let folder = scratch("absurd_lens");
+        let config = write_site(&folder, SIZE);
+        let camera = folder.join("camera.toml");
+        let text = fs::read_to_string(&camera).expect("written");
+        fs::write(&camera, text.replace("[0, 0, 0, 0, 0]", distortion)).expect("writable");
+        let input = folder.join("input.y4m");
+        write_y4m(&input, 25); // the belt is learned in 15
+        let output = run(beltgauge().arg("measure").arg(&input).arg("--config").arg(&config));
+        let text = String::from_utf8_lossy(&output.stderr);
+        assert!([Some(0), Some(2)].contains(&output.status.code()), "{distortion}: {text}");
+    }
+}
+
+#[test]
 fn missing_files_are_named() {
     let folder = scratch("missing_files");
     let config = write_site(&folder, SIZE);

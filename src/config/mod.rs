@@ -62,6 +62,7 @@ impl Site {
                 ));
         }
         let view = BeltView::covering(&camera, &zone, height_max_mm, mm_per_px);
+        check_zone_in_belt_view(&view, &zone)?;
         Ok(Self { config, camera, view, height_max_mm })
     }
 }
@@ -135,6 +136,22 @@ fn check_zone_in_view(camera: &Camera, zone: &BeltRect) -> Result<()> {
         .remedy("make the zone smaller, or check its unit (mm) and the calibration's [pose]"));
     }
     Ok(())
+}
+
+/// A lens model that folds may see the zone's border and yet not the zone.
+fn check_zone_in_belt_view(view: &BeltView, zone: &BeltRect) -> Result<()> {
+    let inside = zone.corners().iter().all(|&corner| {
+        let px = view.px(corner);
+        let [width, height] = view.size_px.map(|n| n as f64);
+        (0.0..width).contains(&px.u) && (0.0..height).contains(&px.v)
+    });
+    if inside {
+        return Ok(());
+    }
+    Err(Error::configuration("the camera does not see the whole zone: its lens model is absurd")
+        .at("[lens] distortion")
+        .allowed("a model that maps the zone into the image without folding")
+        .remedy("check the distortion coefficients and their order, or calibrate again"))
 }
 
 /// The belt seen along the middle lines of the image, for the error text.

@@ -170,7 +170,7 @@ fn table(scenario: &Scenario, records: &[ParcelRecord], progress: &Progress) -> 
     let _ = writeln!(
         text,
         "{} parcels, mean absolute error {:.2} mm, largest {worst:.2} mm; {} frames, {} dropped, \
-         slowest {:.1} ms",
+         slowest frame {:.1} ms in the pipeline",
         records.len(),
         sum / f64::from(count.max(1)),
         progress.status.counters.frames,

@@ -3,8 +3,9 @@
 //! In: for each frame, a track's runs and the grey belt view, with the belt's travel. Out: an
 //! [`Estimate`] at any time, final when the parcel has left. Owns: the views of every pass.
 //! Limits: `limits.views_per_track_max`; a full pass is thinned to every second view.
-//! Cost: a few 10 us a frame and track; a refit every fourth view; the final fit is a dozen
-//! Gauss-Newton steps.
+//! Cost: a few 10 us a frame and track; a refit every fourth view; in the frame of the exit
+//! two silhouettes from three starts each, then up to eight starts of twelve Gauss-Newton
+//! steps on the edges.
 
 mod fit;
 mod model;
