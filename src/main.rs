@@ -1,14 +1,18 @@
 //! Command line only: arguments in, exit status out.
 
+use beltgauge::camera::LensModel;
+use beltgauge::camera::chessboard::Chessboard;
 use beltgauge::config::Site;
 use beltgauge::error::{Error, Result};
 use beltgauge::event::ParcelRecord;
+use beltgauge::run::calibrate::{self, DataSheet};
 use beltgauge::run::demo;
 use beltgauge::run::offline::{self, Observer, Outputs};
 use beltgauge::{run, source};
 use clap::{Parser, Subcommand};
 use std::io::{IsTerminal, Write};
 use std::net::SocketAddr;
+use std::ops::RangeInclusive;
 use std::path::PathBuf;
 use std::process::ExitCode;
 use tracing::Level;
@@ -53,12 +57,106 @@ enum Command {
         #[arg(long)]
         annotate: Option<PathBuf>,
     },
+    /// Calibrate the camera: first its lens, then its place over the belt.
+    #[command(subcommand)]
+    Calibrate(Calibrate),
     /// Validate a configuration and print the memory plan.
     Check {
         /// Configuration file.
         #[arg(long, default_value = "/etc/beltgauge/beltgauge.toml")]
         config: PathBuf,
     },
+}
+
+#[derive(Subcommand)]
+enum Calibrate {
+    /// The lens, from 10 to 20 images of a chessboard held at all places and tilts.
+    Lens {
+        /// Images (PNG, PGM, JPEG, BMP, TIFF), or folders of them.
+        #[arg(required = true)]
+        images: Vec<PathBuf>,
+        /// Inner corners along both sides, as 9x6.
+        #[arg(long, value_parser = board_size)]
+        board: [usize; 2],
+        /// Side of a square.
+        #[arg(long, value_parser = positive)]
+        square_mm: f64,
+        /// Camera file to write; its report goes beside it as .html.
+        #[arg(long)]
+        out: PathBuf,
+        /// Lens model; fisheye for more than about 120 degrees of view.
+        #[arg(long, value_enum, default_value_t = Model::Brown)]
+        model: Model,
+        /// Focal length on the data sheet, as a start for the search.
+        #[arg(long, requires = "sensor_width_mm", value_parser = positive)]
+        focal_mm: Option<f64>,
+        /// Width of the sensor's image area on the data sheet.
+        #[arg(long, requires = "focal_mm", value_parser = positive)]
+        sensor_width_mm: Option<f64>,
+    },
+    /// The place over the belt, from stills of the board lying on the belt and carried by it.
+    Belt {
+        /// Stills in order of time, or a folder of them. One gives the plane alone.
+        #[arg(required_unless_present = "points")]
+        images: Vec<PathBuf>,
+        /// Further stills, of the board laid flat elsewhere on the belt: they make the plane surer.
+        #[arg(long, num_args = 1.., conflicts_with = "points")]
+        elsewhere: Vec<PathBuf>,
+        /// Inner corners along both sides, as 9x6.
+        #[arg(long, value_parser = board_size, required_unless_present = "points")]
+        board: Option<[usize; 2]>,
+        /// Side of a square.
+        #[arg(long, value_parser = positive, required_unless_present = "points")]
+        square_mm: Option<f64>,
+        /// How far the board's printed face lies above the belt.
+        #[arg(long, default_value_t = 0.0, value_parser = not_negative)]
+        board_thickness_mm: f64,
+        /// Instead of stills: surveyed points, a line each: X,Y,Z in mm, u,v in px.
+        #[arg(long, conflicts_with_all = ["images", "board", "square_mm", "board_thickness_mm"])]
+        points: Option<PathBuf>,
+        /// What `calibrate lens` wrote.
+        #[arg(long)]
+        lens: PathBuf,
+        /// Camera file to write; its report goes beside it as .html.
+        #[arg(long)]
+        out: PathBuf,
+    },
+}
+
+/// Lens models by name.
+#[derive(Clone, Copy, clap::ValueEnum)]
+enum Model {
+    Brown,
+    Fisheye,
+}
+
+/// Inner corners that make a board: fewer do not give a pose, more are a typing error.
+const BOARD_CORNERS: RangeInclusive<usize> = 3..=60;
+
+fn board_size(text: &str) -> std::result::Result<[usize; 2], String> {
+    let sides = text.split_once(['x', 'X']).map(|(a, b)| [a.trim().parse(), b.trim().parse()]);
+    match sides {
+        Some([Ok(a), Ok(b)]) if BOARD_CORNERS.contains(&a) && BOARD_CORNERS.contains(&b) => {
+            Ok([a, b])
+        }
+        _ => Err(format!(
+            "give the inner corners along both sides, {} to {}, as 9x6 for 10 by 7 squares",
+            BOARD_CORNERS.start(),
+            BOARD_CORNERS.end()
+        )),
+    }
+}
+
+fn positive(text: &str) -> std::result::Result<f64, String> {
+    let value = not_negative(text)?;
+    if value > 0.0 { Ok(value) } else { Err("give a number of mm above 0".to_owned()) }
+}
+
+fn not_negative(text: &str) -> std::result::Result<f64, String> {
+    match text.parse::<f64>() {
+        Ok(value) if (0.0..=10_000.0).contains(&value) => Ok(value),
+        _ => Err("give a number of mm, 0 to 10000".to_owned()),
+    }
 }
 
 fn main() -> ExitCode {
@@ -113,6 +211,7 @@ fn dispatch(command: Command) -> Result<()> {
             let counters = offline::measure(source, site, outputs, &mut Console)?;
             print(format_args!("{counters}"))
         }
+        Command::Calibrate(what) => calibrate(what),
         Command::Check { config } => {
             let site = Site::load(&config)?;
             let plan = run::plan(&site);
@@ -121,4 +220,47 @@ fn dispatch(command: Command) -> Result<()> {
             print(format_args!("the configuration is valid"))
         }
     }
+}
+
+fn calibrate(what: Calibrate) -> Result<()> {
+    let mut say = |line: &str| print(format_args!("{line}"));
+    let (warnings, out) = match what {
+        Calibrate::Lens { images, board, square_mm, out, model, focal_mm, sensor_width_mm } => {
+            let board = Chessboard::new(board, square_mm);
+            let model = match model {
+                Model::Brown => LensModel::Brown,
+                Model::Fisheye => LensModel::Fisheye,
+            };
+            let data_sheet = focal_mm
+                .zip(sensor_width_mm)
+                .map(|(focal_mm, sensor_width_mm)| DataSheet { focal_mm, sensor_width_mm });
+            (calibrate::lens(&images, &board, model, data_sheet, &out, &mut say)?, out)
+        }
+        Calibrate::Belt { points: Some(csv), lens, out, .. } => {
+            (calibrate::points(&csv, &lens, &out, &mut say)?, out)
+        }
+        Calibrate::Belt {
+            images,
+            elsewhere,
+            board,
+            square_mm,
+            board_thickness_mm: thickness_mm,
+            lens,
+            out,
+            ..
+        } => {
+            let (Some(board), Some(square_mm)) = (board, square_mm) else {
+                return Err(Error::configuration("--board and --square-mm are missing"));
+            };
+            let board = Chessboard::new(board, square_mm);
+            let (images, elsewhere) = (&images[..], &elsewhere[..]);
+            let warnings =
+                calibrate::belt(images, elsewhere, &board, thickness_mm, &lens, &out, &mut say)?;
+            (warnings, out)
+        }
+    };
+    for warning in &warnings {
+        let _ = writeln!(std::io::stderr(), "warning: {warning}");
+    }
+    print(format_args!("wrote {} and {}", out.display(), out.with_extension("html").display()))
 }

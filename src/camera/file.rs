@@ -1,9 +1,9 @@
 //! `camera.toml`: lens and pose as `calibrate` writes them and as a technician may by hand.
 
-use super::{Camera, Lens, LensModel};
+use super::{Camera, LENS_PARAMETERS, Lens, LensModel};
 use crate::error::{Error, Result};
 use nalgebra::{Matrix3, Vector3};
-use serde::Deserialize;
+use serde::{Deserialize, Serialize};
 use std::path::Path;
 
 /// The file as written. Unknown keys are allowed: calibration reports add to it.
@@ -11,11 +11,12 @@ use std::path::Path;
 pub struct CameraFile {
     image_size_px: [usize; 2],
     lens: LensTable,
+    lens_sigma: Option<LensSigmaTable>,
     pose: Option<PoseTable>,
 }
 
-#[derive(Clone, Debug, Deserialize)]
-struct LensTable {
+#[derive(Clone, Debug, Deserialize, Serialize)]
+pub(super) struct LensTable {
     model: LensModel,
     fx_px: f64,
     fy_px: f64,
@@ -24,8 +25,18 @@ struct LensTable {
     distortion: Vec<f64>,
 }
 
-#[derive(Clone, Debug, Deserialize)]
-struct PoseTable {
+/// Standard deviations of the lens's parameters.
+#[derive(Clone, Debug, Deserialize, Serialize)]
+pub struct LensSigmaTable {
+    fx_px: f64,
+    fy_px: f64,
+    cx_px: f64,
+    cy_px: f64,
+    distortion: Vec<f64>,
+}
+
+#[derive(Clone, Debug, Deserialize, Serialize)]
+pub(super) struct PoseTable {
     rotation: [[f64; 3]; 3],
     translation_mm: [f64; 3],
 }
@@ -37,33 +48,42 @@ const IMAGE_SIDE_PX: std::ops::RangeInclusive<usize> = 64..=16384;
 impl CameraFile {
     /// Read and validate a camera file with a pose.
     pub fn load(path: &Path) -> Result<Camera> {
+        Self::read(
+            path,
+            "set camera.calibration to a file with [lens] and [pose], as `beltgauge calibrate belt` writes it",
+        )?
+        .into_camera()
+        .map_err(|e| e.in_file(path))
+    }
+
+    /// Read and validate a camera file for its lens alone.
+    pub fn load_lens(path: &Path) -> Result<CalibratedLens> {
+        let file =
+            Self::read(path, "give the file that `beltgauge calibrate lens` wrote with --lens")?;
+        let lens = file.checked_lens().map_err(|e| e.in_file(path))?;
+        Ok(CalibratedLens { image_size_px: file.image_size_px, lens, sigma: file.lens_sigma })
+    }
+
+    fn read(path: &Path, remedy: &str) -> Result<Self> {
         let text = std::fs::read_to_string(path).map_err(|e| {
             Error::configuration(format!("cannot read the camera calibration: {e}"))
                 .in_file(path)
-                .remedy(
-                    "set camera.calibration to a file with [lens] and [pose], as in config/example",
-                )
+                .remedy(remedy)
         })?;
-        let file: Self = toml::from_str(&text).map_err(|e| {
+        toml::from_str(&text).map_err(|e| {
             Error::configuration(format!("not a camera calibration: {}", e.to_string().trim_end()))
                 .in_file(path)
                 .remedy("correct the line shown; config/example has a whole file")
-        })?;
-        file.into_camera().map_err(|e| e.in_file(path))
+        })
     }
 
     /// Validate.
     pub fn into_camera(self) -> Result<Camera> {
-        let [width, height] = self.image_size_px;
-        if !IMAGE_SIDE_PX.contains(&width) || !IMAGE_SIDE_PX.contains(&height) {
-            return Err(Error::configuration(format!("image_size_px = [{width}, {height}]"))
-                .allowed(format!("{} to {} px", IMAGE_SIDE_PX.start(), IMAGE_SIDE_PX.end()))
-                .remedy("give width and height of the camera's image in pixels"));
-        }
-        let lens = self.lens.into_lens(self.image_size_px)?;
+        let lens = self.checked_lens()?;
         let pose = self.pose.ok_or_else(|| {
             Error::configuration("[pose] is missing: a lens alone does not know the belt").remedy(
-                "add rotation and translation_mm of the camera over the belt, as in config/example",
+                "run `beltgauge calibrate belt` with this file as --lens, or add rotation and \
+                 translation_mm of the camera over the belt as in config/example",
             )
         })?;
         let (camera_from_belt, translation_mm) = pose.into_transform()?;
@@ -79,10 +99,65 @@ impl CameraFile {
         }
         Ok(camera)
     }
+
+    fn checked_lens(&self) -> Result<Lens> {
+        let [width, height] = self.image_size_px;
+        if !IMAGE_SIDE_PX.contains(&width) || !IMAGE_SIDE_PX.contains(&height) {
+            return Err(Error::configuration(format!("image_size_px = [{width}, {height}]"))
+                .allowed(format!("{} to {} px", IMAGE_SIDE_PX.start(), IMAGE_SIDE_PX.end()))
+                .remedy("give width and height of the camera's image in pixels"));
+        }
+        self.lens.to_lens(self.image_size_px)
+    }
+}
+
+/// A lens, as its calibration file has it.
+#[derive(Clone, Debug)]
+pub struct CalibratedLens {
+    /// Width and height of the images it was calibrated on.
+    pub image_size_px: [usize; 2],
+    /// The lens.
+    pub lens: Lens,
+    /// How far it can be trusted; `None` when the file does not say.
+    pub sigma: Option<LensSigmaTable>,
+}
+
+impl CalibratedLens {
+    /// Relative standard deviation of the focal length; 0 when unknown.
+    pub fn focal_sigma(&self) -> f64 {
+        self.sigma.as_ref().map_or(0.0, |s| s.fx_px.max(s.fy_px) / self.lens.fx_px)
+    }
+}
+
+impl LensSigmaTable {
+    /// From standard deviations in the order of [`Lens::parameters`].
+    pub fn new(model: LensModel, sigma: [f64; LENS_PARAMETERS]) -> Self {
+        let [fx_px, fy_px, cx_px, cy_px, ..] = sigma;
+        let distortion = sigma[4..4 + model.distortion_count()].to_vec();
+        Self { fx_px, fy_px, cx_px, cy_px, distortion }
+    }
+}
+
+impl From<&Lens> for LensTable {
+    fn from(lens: &Lens) -> Self {
+        let Lens { model, fx_px, fy_px, cx_px, cy_px, .. } = *lens;
+        let distortion = lens.distortion[..model.distortion_count()].to_vec();
+        Self { model, fx_px, fy_px, cx_px, cy_px, distortion }
+    }
+}
+
+impl From<&Camera> for PoseTable {
+    fn from(camera: &Camera) -> Self {
+        let rotation = camera.camera_from_belt;
+        Self {
+            rotation: std::array::from_fn(|i| std::array::from_fn(|j| rotation[(i, j)])),
+            translation_mm: camera.translation_mm.into(),
+        }
+    }
 }
 
 impl LensTable {
-    fn into_lens(self, [width, height]: [usize; 2]) -> Result<Lens> {
+    fn to_lens(&self, [width, height]: [usize; 2]) -> Result<Lens> {
         for (key, value, end) in [
             ("fx_px", self.fx_px, 100 * width),
             ("fy_px", self.fy_px, 100 * height),

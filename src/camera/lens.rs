@@ -3,16 +3,40 @@
 //! Source: `OpenCV`'s calib3d and fisheye modules; Kannala and Brandt 2006, eq. 6.
 
 use crate::units::RawPx;
-use nalgebra::{Matrix2, Vector2, Vector3};
+use nalgebra::{Matrix2, Matrix2x3, SMatrix, Vector2, Vector3};
 
 /// Which polynomial bends the rays.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, serde::Deserialize)]
+#[derive(Clone, Copy, Debug, PartialEq, Eq, serde::Deserialize, serde::Serialize)]
 #[serde(rename_all = "lowercase")]
 pub enum LensModel {
     /// Radial k1 k2 k3 and tangential p1 p2 terms on the normalised image plane.
     Brown,
     /// Polynomial k1..k4 in the angle to the optical axis.
     Fisheye,
+}
+
+impl LensModel {
+    /// Coefficients that are written down.
+    pub fn distortion_count(self) -> usize {
+        match self {
+            Self::Brown => 5,
+            Self::Fisheye => 4,
+        }
+    }
+}
+
+/// Parameters of a lens, in this order: fx, fy, cx, cy, then the five of the distortion.
+pub const LENS_PARAMETERS: usize = 9;
+
+/// A projected point and how it moves with the point and with the lens.
+#[derive(Clone, Copy, Debug)]
+pub struct Projection {
+    /// The image.
+    pub px: Vector2<f64>,
+    /// Derivative by the point in the camera frame, px per mm.
+    pub by_point: Matrix2x3<f64>,
+    /// Derivative by the lens parameters.
+    pub by_lens: SMatrix<f64, 2, LENS_PARAMETERS>,
 }
 
 /// Projection from camera coordinates to raw pixels.
@@ -114,6 +138,81 @@ impl Lens {
                 Some(Vector3::new(across.x, across.y, theta.cos()))
             }
         }
+    }
+
+    /// All parameters in the order of [`LENS_PARAMETERS`].
+    pub fn parameters(&self) -> [f64; LENS_PARAMETERS] {
+        let [a, b, c, d, e] = self.distortion;
+        [self.fx_px, self.fy_px, self.cx_px, self.cy_px, a, b, c, d, e]
+    }
+
+    /// A lens from all its parameters.
+    pub fn from_parameters(model: LensModel, all: [f64; LENS_PARAMETERS]) -> Self {
+        let [fx, fy, cx, cy, a, b, c, d, e] = all;
+        Self::new(model, [fx, fy], [cx, cy], [a, b, c, d, e])
+    }
+
+    /// Image of a point with its derivatives, also where the model folds back: a calibration
+    /// on its way may pass there. `None` behind a brown lens and in the centre of a fisheye.
+    pub fn linearise(&self, in_camera: Vector3<f64>) -> Option<Projection> {
+        let focal = Matrix2::new(self.fx_px, 0.0, 0.0, self.fy_px);
+        let (distorted, by_point, by_distortion) = match self.model {
+            LensModel::Brown => self.linearise_brown(in_camera)?,
+            LensModel::Fisheye => self.linearise_fisheye(in_camera)?,
+        };
+        let mut by_lens = SMatrix::<f64, 2, LENS_PARAMETERS>::zeros();
+        by_lens[(0, 0)] = distorted.x;
+        by_lens[(1, 1)] = distorted.y;
+        by_lens[(0, 2)] = 1.0;
+        by_lens[(1, 3)] = 1.0;
+        by_lens.fixed_view_mut::<2, 5>(0, 4).copy_from(&(focal * by_distortion));
+        Some(Projection {
+            px: focal * distorted + Vector2::new(self.cx_px, self.cy_px),
+            by_point: focal * by_point,
+            by_lens,
+        })
+    }
+
+    fn linearise_brown(
+        &self,
+        at: Vector3<f64>,
+    ) -> Option<(Vector2<f64>, Matrix2x3<f64>, SMatrix<f64, 2, 5>)> {
+        if at.z <= 0.0 {
+            return None;
+        }
+        let p = at.xy() / at.z;
+        let (distorted, jacobian) = self.distort_brown(p);
+        let division = Matrix2x3::new(1.0, 0.0, -p.x, 0.0, 1.0, -p.y) / at.z;
+        let r2 = p.norm_squared();
+        let (xy, xx, yy) = (2.0 * p.x * p.y, r2 + 2.0 * p.x * p.x, r2 + 2.0 * p.y * p.y);
+        let columns =
+            [p * r2, p * (r2 * r2), Vector2::new(xy, yy), Vector2::new(xx, xy), p * (r2 * r2 * r2)];
+        Some((distorted, jacobian * division, SMatrix::from_columns(&columns)))
+    }
+
+    fn linearise_fisheye(
+        &self,
+        at: Vector3<f64>,
+    ) -> Option<(Vector2<f64>, Matrix2x3<f64>, SMatrix<f64, 2, 5>)> {
+        let (radius, square) = (at.xy().norm(), at.norm_squared());
+        if radius <= 1e-9 * square.sqrt() {
+            return None; // no direction to bend in
+        }
+        let theta = radius.atan2(at.z);
+        let outward = at.xy() / radius;
+        let bent = self.distort_angle(theta);
+        let slope = self.radial_slope(theta);
+        // Radially the angle changes, tangentially only the direction.
+        let theta_by_radius = at.z / square;
+        let across = Matrix2::identity() - outward * outward.transpose();
+        let by_xy =
+            outward * outward.transpose() * (slope * theta_by_radius) + across * (bent / radius);
+        let by_z = outward * (-slope * radius / square);
+        let by_point = Matrix2x3::new(by_xy.m11, by_xy.m12, by_z.x, by_xy.m21, by_xy.m22, by_z.y);
+        let t2 = theta * theta;
+        let powers = [theta * t2, theta * t2 * t2, theta * t2.powi(3), theta * t2.powi(4), 0.0];
+        let by_distortion = SMatrix::from_columns(&powers.map(|power| outward * power));
+        Some((outward * bent, by_point, by_distortion))
     }
 
     /// Distorted normalised point and its Jacobian.
@@ -229,6 +328,37 @@ mod tests {
         let [_, fisheye] = lenses();
         let px = fisheye.project(Vector3::new(300.0, -200.0, 1000.0)).expect("in front");
         assert!((px.x - FISHEYE_OPENCV[0]).hypot(px.y - FISHEYE_OPENCV[1]) < 1e-6, "{px:?}");
+    }
+
+    #[test]
+    fn derivatives_are_those_of_the_projection() {
+        for lens in lenses() {
+            let at = Vector3::new(0.3, -0.45, 0.9);
+            let here = lens.linearise(at).expect("in front");
+            let projected = lens.project(at).expect("in front");
+            assert!((here.px - Vector2::new(projected.x, projected.y)).norm() < 1e-9);
+            // Central differences: their error is of the order of the step's square.
+            let step = 1e-6;
+            for k in 0..3 {
+                let moved = |sign: f64| {
+                    let mut point = at;
+                    point[k] += sign * step;
+                    lens.linearise(point).expect("in front").px
+                };
+                let slope = (moved(1.0) - moved(-1.0)) / (2.0 * step);
+                assert!((slope - here.by_point.column(k)).norm() < 1e-4, "{lens:?} point {k}");
+            }
+            for k in 0..LENS_PARAMETERS {
+                let moved = |sign: f64| {
+                    let mut all = lens.parameters();
+                    all[k] += sign * step;
+                    let lens = Lens::from_parameters(lens.model, all);
+                    lens.linearise(at).expect("in front").px
+                };
+                let slope = (moved(1.0) - moved(-1.0)) / (2.0 * step);
+                assert!((slope - here.by_lens.column(k)).norm() < 1e-4, "{lens:?} parameter {k}");
+            }
+        }
     }
 
     #[test]

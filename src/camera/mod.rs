@@ -4,12 +4,16 @@
 //! height above the belt. A transform is named `target_from_source`.
 //! Source: Hartley and Zisserman, Multiple View Geometry, chapter 6; `OpenCV`'s conventions.
 
+pub mod calibrate;
+mod calibration_file;
+pub mod chessboard;
 mod file;
 mod lens;
 mod view;
 
-pub use file::CameraFile;
-pub use lens::{Lens, LensModel};
+pub use calibration_file::{BeltTable, CalibrationFile, ImageEntry};
+pub use file::{CalibratedLens, CameraFile, LensSigmaTable};
+pub use lens::{LENS_PARAMETERS, Lens, LensModel, Projection};
 pub use view::BeltView;
 
 use crate::units::{BeltMm, RawPx};

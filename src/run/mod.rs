@@ -1,10 +1,13 @@
-//! The rooms that know source, pipeline and plc: offline measuring, the appliance, the demo.
+//! The rooms that know source, pipeline and plc: offline measuring, the appliance, the demo,
+//! calibration.
 
 mod annotate;
 mod appliance;
+pub mod calibrate;
 pub mod demo;
 mod memory;
 pub mod offline;
+mod report;
 
 pub use annotate::Annotator;
 pub use appliance::{Appliance, Pace, Progress};

@@ -1,11 +1,9 @@
-//! A directory of PNG, PGM or JPEG frames, in order of name.
+//! A directory of image files, in order of name.
 
-use super::FrameSource;
+use super::{FrameSource, Still, stills_in};
 use crate::error::{Error, Result};
 use crate::image::FrameTime;
 use std::path::{Path, PathBuf};
-
-const EXTENSIONS: [&str; 4] = ["png", "pgm", "jpg", "jpeg"];
 
 /// The frames of a directory. Decoding allocates: a replay, not a camera.
 pub struct Directory {
@@ -23,35 +21,9 @@ impl Directory {
                 .in_file(folder)
                 .remedy("give the camera's frames a second with --fps")
         })?;
-        let unreadable = |e: std::io::Error| {
-            Error::failure(format!("cannot list the directory: {e}")).in_file(folder)
-        };
-        let mut files = Vec::new();
-        for entry in std::fs::read_dir(folder).map_err(unreadable)? {
-            let path = entry.map_err(unreadable)?.path();
-            let extension = path.extension().and_then(|e| e.to_str()).map(str::to_ascii_lowercase);
-            let is_image = extension.is_some_and(|e| EXTENSIONS.contains(&e.as_str()));
-            if is_image && path.is_file() {
-                files.push(path);
-            }
-        }
-        files.sort();
-        let first = files.first().ok_or_else(|| {
-            Error::configuration("the directory holds no frames")
-                .in_file(folder)
-                .allowed("*.png, *.pgm, *.jpg, *.jpeg")
-        })?;
-        let (width, height) = image::ImageReader::open(first)
-            .and_then(image::ImageReader::with_guessed_format)
-            .map_err(image::ImageError::IoError)
-            .and_then(image::ImageReader::into_dimensions)
-            .map_err(|e| Error::failure(format!("unreadable image: {e}")).in_file(first))?;
-        Ok(Self {
-            files: files.into_iter(),
-            size_px: [width as usize, height as usize],
-            fps,
-            next_index: 0,
-        })
+        let files = stills_in(folder)?;
+        let size_px = Still::size_of(&files[0])?;
+        Ok(Self { files: files.into_iter(), size_px, fps, next_index: 0 })
     }
 }
 
@@ -67,26 +39,18 @@ impl FrameSource for Directory {
     fn next_into(&mut self, frame: &mut [u8]) -> Result<Option<FrameTime>> {
         let Some(path) = self.files.next() else { return Ok(None) };
         let remedy = "replace or remove this file; what was measured before it is written";
-        let image = image::ImageReader::open(&path)
-            .and_then(image::ImageReader::with_guessed_format)
-            .map_err(|e| Error::failure(format!("cannot open: {e}")).in_file(&path))?
-            .decode()
-            .map_err(|e| {
-                Error::failure(format!("unreadable image: {e}")).in_file(&path).remedy(remedy)
-            })?
-            .into_luma8();
+        let still = Still::load(&path).map_err(|e| e.remedy(remedy))?;
         let [width, height] = self.size_px;
-        if [image.width() as usize, image.height() as usize] != [width, height] {
+        if still.size_px != self.size_px {
             return Err(Error::failure(format!(
                 "a frame of {} x {} px",
-                image.width(),
-                image.height()
+                still.size_px[0], still.size_px[1]
             ))
             .in_file(&path)
             .allowed(format!("{width} x {height} px, as the first frame"))
             .remedy(remedy));
         }
-        frame.copy_from_slice(image.as_raw());
+        frame.copy_from_slice(&still.pixels);
         let index = self.next_index;
         self.next_index += 1;
         Ok(Some(FrameTime { index, t_s: index as f64 / self.fps }))

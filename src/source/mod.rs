@@ -1,10 +1,12 @@
 //! Where frames come from: files, a directory, or the synthetic belt.
 
 mod directory;
+mod still;
 pub mod synthetic;
 mod y4m;
 
 pub use directory::Directory;
+pub use still::{Still, stills_in};
 pub use y4m::Y4m;
 
 use crate::error::{Error, Result};

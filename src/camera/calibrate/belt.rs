@@ -1,0 +1,445 @@
+//! The belt plane and the direction of travel from stills of a board lying on the belt.
+
+use super::bundle::board_pose;
+use super::least_squares::{DIFFERENCE, Normal, Numeric, minimise};
+use super::{Pose, camera_over_belt, reprojection_error};
+use crate::camera::chessboard::{BoardImage, Chessboard, Corner};
+use crate::camera::{CalibratedLens, Camera, Lens};
+use crate::error::{Error, Result};
+use nalgebra::{DVector, Matrix3, Rotation2, Vector2, Vector3};
+
+/// A still and what to call it in an error.
+#[derive(Clone, Copy, Debug)]
+pub struct BeltStill<'a> {
+    /// File name.
+    pub name: &'a str,
+    /// The board in it.
+    pub board: &'a BoardImage,
+}
+
+/// One still's part in a calibration.
+#[derive(Clone, Debug)]
+pub struct StillResult {
+    /// Root mean square distance of its corners from where they should be, px.
+    pub rms_px: f64,
+    /// Each corner and its error (seen minus expected), px.
+    pub residuals: Vec<(Corner, Vector2<f64>)>,
+}
+
+/// A camera over its belt.
+#[derive(Clone, Debug)]
+pub struct BeltCalibration {
+    /// Lens and pose.
+    pub camera: Camera,
+    /// Root mean square distance of all corners from where they should be, px.
+    pub rms_px: f64,
+    /// Each still's part.
+    pub stills: Vec<StillResult>,
+    /// Standard deviation of the camera's height above the belt.
+    pub sigma_height_mm: f64,
+    /// Standard deviation of the belt plane's tilt (the larger of its two directions).
+    pub sigma_tilt_deg: f64,
+    /// Standard deviation of the direction of travel; `None` when it was assumed.
+    pub sigma_travel_deg: Option<f64>,
+    /// How far the board was carried from each still to the first, mm.
+    pub travel_mm: Vec<f64>,
+    /// What the technician should know, in plain words.
+    pub warnings: Vec<String>,
+}
+
+/// A carried board does not turn: less than this is noise or slack.
+const TURN_DEG_MAX: f64 = 0.5;
+/// A carried board keeps to its line, as part of the way, and never better than mm.
+const SIDEWAYS_MAX: f64 = 0.01;
+const SIDEWAYS_MM_MAX: f64 = 1.5;
+/// Estimates are taken for different when this many standard deviations apart.
+const SIGMAS: f64 = 5.0;
+/// A still's error, lying in the common plane, against that on its own.
+const FLAT_RATIO: f64 = 2.0;
+const FLAT_PX: f64 = 0.3;
+/// A travel direction from a shorter way, in squares, is worth little.
+const TRAVEL_SQUARES_WANTED: f64 = 4.0;
+const STEPS_MAX: usize = 50;
+
+/// The pose of the camera over the belt.
+///
+/// `stills` are of the board lying flat: first, in order of time, `pass` of them as the belt
+/// carries it, then any number of it laid elsewhere, which make the plane surer. The board's
+/// printed face lies `thickness_mm` above the belt. `focal_sigma` is the relative standard
+/// deviation of the lens's focal length: the height inherits it.
+///
+/// # Errors
+/// Stills that are not one pass of a board lying flat and carried by the belt.
+pub fn calibrate_belt(
+    board: &Chessboard,
+    lens: &CalibratedLens,
+    stills: &[BeltStill<'_>],
+    pass: usize,
+    thickness_mm: f64,
+) -> Result<BeltCalibration> {
+    let named =
+        Stills { board, lens: &lens.lens, stills, corners: same_orientation(board, stills) };
+    let first = named.own_fit(0)?.first;
+    let plane = named.lie_flat(first)?;
+    let fit = if pass > 1 { named.carried(first, &plane, pass)? } else { plane };
+    let sigma_px = fit.sigma_px();
+    let covariance = fit
+        .normal
+        .covariance()
+        .ok_or_else(|| Error::failure("the corners do not determine the belt plane"))?
+        * (sigma_px * sigma_px);
+    let camera_of = |x: &DVector<f64>| {
+        let belt = belt_frame(pose_of(first, x), fit.layout.direction(x), thickness_mm);
+        camera_over_belt(&lens.lens, lens.image_size_px, belt)
+    };
+    let camera = camera_of(&fit.parameters);
+    // Of a value computed from the parameters, by its slopes.
+    let sigma = |value: &dyn Fn(&Camera) -> f64| {
+        let slopes = DVector::from_fn(fit.parameters.len(), |k, _| {
+            let moved = |sign: f64| {
+                let mut parameters = fit.parameters.clone();
+                parameters[k] += sign * DIFFERENCE;
+                value(&camera_of(&parameters))
+            };
+            (moved(1.0) - moved(-1.0)) / (2.0 * DIFFERENCE)
+        });
+        (slopes.transpose() * &covariance * slopes)[0].max(0.0).sqrt()
+    };
+    // Small turns about the belt's axes: entries of the rotation against the one found.
+    let turn_deg = |other: &Camera, row: usize, column: usize| {
+        (camera.camera_from_belt.transpose() * other.camera_from_belt)[(row, column)].to_degrees()
+    };
+    let height_mm = camera.centre_in_belt().z;
+    let ways_mm = fit.layout.ways(&fit.parameters);
+    Ok(BeltCalibration {
+        rms_px: fit.rms_px(),
+        sigma_height_mm: sigma(&|c| c.centre_in_belt().z).hypot(lens.focal_sigma() * height_mm),
+        sigma_tilt_deg: sigma(&|c| turn_deg(c, 0, 2)).max(sigma(&|c| turn_deg(c, 1, 2))),
+        sigma_travel_deg: (pass > 1).then(|| sigma(&|c| turn_deg(c, 1, 0))),
+        warnings: warnings(board, &ways_mm),
+        travel_mm: ways_mm,
+        stills: fit.stills,
+        camera,
+    })
+}
+
+fn warnings(board: &Chessboard, ways_mm: &[f64]) -> Vec<String> {
+    let mut warnings = Vec::new();
+    let way_mm = ways_mm.last().copied().unwrap_or(0.0);
+    if ways_mm.len() == 1 {
+        warnings.push(
+            "the direction of travel is not known from one still: +X was laid along the image's rows, \
+             left to right; let the belt carry the board and take two or more stills"
+                .to_owned(),
+        );
+    } else if way_mm < TRAVEL_SQUARES_WANTED * board.square_mm {
+        warnings.push(format!(
+            "the board was carried only {way_mm:.0} mm: let it travel through the whole image"
+        ));
+    }
+    if ways_mm.len() == 2 {
+        warnings.push(
+            "two stills cannot show whether the board kept to a straight line: take a third"
+                .to_owned(),
+        );
+    }
+    if ways_mm.len() > 1 && board.is_symmetric() {
+        warnings.push(
+            "this board looks the same after half a turn: make sure that it was not turned"
+                .to_owned(),
+        );
+    }
+    warnings
+}
+
+/// The stills' corners with one name for each: a symmetric board is named from the end that is
+/// nearest to how the first still has it.
+fn same_orientation(board: &Chessboard, stills: &[BeltStill<'_>]) -> Vec<Vec<Corner>> {
+    let direction = |corners: &[Corner]| {
+        corners
+            .iter()
+            .map(|c| {
+                Vector2::new(c.at.x, c.at.y) * (c.column as f64 - 0.5 * (board.columns - 1) as f64)
+            })
+            .sum::<Vector2<f64>>()
+    };
+    let first = stills.first().map_or_else(Vector2::zeros, |s| direction(&s.board.corners));
+    stills
+        .iter()
+        .map(|still| {
+            let corners = &still.board.corners;
+            if board.is_symmetric() && direction(corners).dot(&first) < 0.0 {
+                corners.iter().map(|c| board.half_turn(c)).collect()
+            } else {
+                corners.clone()
+            }
+        })
+        .collect()
+}
+
+/// The parameters of a fit: the first board's turn and shift; of a pass its direction (rad, in
+/// the first board's frame) and the way (mm) of every further still; of every other still its
+/// shift x, y (mm) and turn (rad) in the plane.
+#[derive(Clone, Copy)]
+struct Layout {
+    /// Stills of the pass; 1 when every still has its own place.
+    pass: usize,
+    stills: usize,
+}
+
+impl Layout {
+    const DIRECTION: usize = 6;
+
+    fn count(self) -> usize {
+        self.free(self.stills)
+    }
+
+    /// First parameter of a still that is not of the pass.
+    fn free(self, still: usize) -> usize {
+        let of_pass = if self.pass > 1 { self.pass } else { 0 };
+        Self::DIRECTION + of_pass + 3 * (still - self.pass)
+    }
+
+    fn direction(self, x: &DVector<f64>) -> Option<Vector2<f64>> {
+        let angle = (self.pass > 1).then(|| x[Self::DIRECTION])?;
+        Some(Vector2::new(angle.cos(), angle.sin()))
+    }
+
+    /// How far each still of the pass is from the first.
+    fn ways(self, x: &DVector<f64>) -> Vec<f64> {
+        (0..self.pass).map(|k| if k == 0 { 0.0 } else { x[Self::DIRECTION + k] }).collect()
+    }
+
+    /// Where a point of a still's board is in the first board's plane.
+    fn place(self, x: &DVector<f64>, still: usize, point: Vector2<f64>) -> Vector2<f64> {
+        match self.direction(x) {
+            _ if still == 0 => point,
+            Some(along) if still < self.pass => point + x[Self::DIRECTION + still] * along,
+            _ => {
+                let k = self.free(still);
+                Rotation2::new(x[k + 2]) * point + Vector2::new(x[k], x[k + 1])
+            }
+        }
+    }
+}
+
+/// A fit of stills with shared parameters.
+struct Fit {
+    layout: Layout,
+    first: Pose,
+    parameters: DVector<f64>,
+    normal: Normal,
+    stills: Vec<StillResult>,
+}
+
+impl Fit {
+    fn corners(&self) -> f64 {
+        self.stills.iter().map(|s| s.residuals.len()).sum::<usize>() as f64
+    }
+
+    fn rms_px(&self) -> f64 {
+        (self.normal.cost / self.corners()).sqrt()
+    }
+
+    /// Of one coordinate.
+    fn sigma_px(&self) -> f64 {
+        let freedom = 2.0 * self.corners() - self.parameters.len() as f64;
+        (self.normal.cost / freedom.max(1.0)).sqrt()
+    }
+}
+
+/// The first board's pose after a small turn and shift.
+fn pose_of(first: Pose, x: &DVector<f64>) -> Pose {
+    first.moved(Vector3::new(x[0], x[1], x[2]), Vector3::new(x[3], x[4], x[5]))
+}
+
+/// All stills, with one name for each corner.
+struct Stills<'a> {
+    board: &'a Chessboard,
+    lens: &'a Lens,
+    stills: &'a [BeltStill<'a>],
+    corners: Vec<Vec<Corner>>,
+}
+
+impl Stills<'_> {
+    /// Minimise the distances of all corners of `corners`.
+    fn fit(
+        &self,
+        layout: Layout,
+        first: Pose,
+        corners: &[Vec<Corner>],
+        start: DVector<f64>,
+    ) -> Option<Fit> {
+        let still_errors = |x: &DVector<f64>, still: usize| -> Option<Vec<f64>> {
+            let pose = pose_of(first, x);
+            let mut errors = Vec::with_capacity(2 * corners[still].len());
+            for corner in &corners[still] {
+                let at = layout.place(x, still, self.board.place_mm(corner));
+                errors.extend(reprojection_error(self.lens, pose.apply(at.push(0.0)), corner.at)?);
+            }
+            Some(errors)
+        };
+        let errors = |x: &DVector<f64>| {
+            let all: Option<Vec<_>> = (0..corners.len()).map(|k| still_errors(x, k)).collect();
+            Some(all?.concat())
+        };
+        let (fitted, normal) = minimise(Numeric { parameters: start, errors }, STEPS_MAX)?;
+        let parameters = fitted.parameters;
+        let result = |still: usize| {
+            let errors = still_errors(&parameters, still)?;
+            let squares: f64 = errors.iter().map(|e| e * e).sum();
+            let residual = |(&corner, e): (&Corner, &[f64])| (corner, -Vector2::new(e[0], e[1]));
+            Some(StillResult {
+                rms_px: (squares / corners[still].len() as f64).sqrt(),
+                residuals: corners[still]
+                    .iter()
+                    .zip(errors.chunks_exact(2))
+                    .map(residual)
+                    .collect(),
+            })
+        };
+        let stills = (0..corners.len()).map(result).collect::<Option<_>>()?;
+        Some(Fit { layout, first: pose_of(first, &parameters), parameters, normal, stills })
+    }
+
+    /// One still's board on its own.
+    fn own_fit(&self, still: usize) -> Result<Fit> {
+        let corners = &self.corners[still];
+        board_pose(self.board, self.lens, corners)
+            .and_then(|start| {
+                let layout = Layout { pass: 1, stills: 1 };
+                let start_parameters = DVector::zeros(layout.count());
+                self.fit(layout, start, std::slice::from_ref(corners), start_parameters)
+            })
+            .ok_or_else(|| {
+                Error::configuration("the board's corners do not give its pose with this lens")
+                    .at(self.stills[still].name)
+                    .remedy("check that --lens belongs to this camera and its images")
+            })
+    }
+
+    /// All boards in one plane, each anywhere and turned anyhow in it.
+    fn lie_flat(&self, first: Pose) -> Result<Fit> {
+        let layout = Layout { pass: 1, stills: self.stills.len() };
+        let mut start = DVector::zeros(layout.count());
+        let mut own_rms_px = Vec::with_capacity(self.stills.len());
+        for still in 0..self.stills.len() {
+            let own = self.own_fit(still)?;
+            own_rms_px.push(own.rms_px());
+            if still > 0 {
+                let relative = first.rotation.transpose() * own.first.rotation;
+                let shift = own.first.translation_mm - first.translation_mm;
+                let shift = first.rotation.transpose() * shift;
+                let turn = (relative.m21 - relative.m12).atan2(relative.m11 + relative.m22);
+                let k = layout.free(still);
+                start.rows_mut(k, 3).copy_from_slice(&[shift.x, shift.y, turn]);
+            }
+        }
+        let fit = self
+            .fit(layout, first, &self.corners, start)
+            .ok_or_else(|| Error::failure("the belt plane does not converge"))?;
+        for (still, (fitted, own_px)) in self.stills.iter().zip(fit.stills.iter().zip(own_rms_px)) {
+            let together_px = fitted.rms_px;
+            if together_px > FLAT_PX.max(FLAT_RATIO * own_px) {
+                return Err(Error::configuration(format!(
+                    "the board does not lie in one plane with the others: \
+                     {together_px:.2} px off, {own_px:.2} px on its own"
+                ))
+                .at(still.name)
+                .remedy(
+                    "lay the board flat on the belt, do not hold it; do not move the camera \
+                     between stills",
+                ));
+            }
+        }
+        Ok(fit)
+    }
+
+    /// The first `pass` boards on one straight way, turned alike.
+    fn carried(&self, first: Pose, plane: &Fit, pass: usize) -> Result<Fit> {
+        let ways = self.ways_of_one_pass(plane, pass)?;
+        let last = ways[pass - 1];
+        let layout = Layout { pass, stills: self.stills.len() };
+        let mut start = DVector::zeros(layout.count());
+        start
+            .rows_mut(0, Layout::DIRECTION)
+            .copy_from(&plane.parameters.rows(0, Layout::DIRECTION));
+        start[Layout::DIRECTION] = last.y.atan2(last.x);
+        for (k, way) in ways.iter().enumerate().skip(1) {
+            start[Layout::DIRECTION + k] = way.dot(&last.normalize());
+        }
+        for still in pass..self.stills.len() {
+            let from = plane.parameters.rows(plane.layout.free(still), 3);
+            start.rows_mut(layout.free(still), 3).copy_from(&from);
+        }
+        self.fit(layout, first, &self.corners, start)
+            .ok_or_else(|| Error::failure("the direction of travel does not converge"))
+    }
+
+    /// The way of each of the first `pass` stills from the first, checked to be one pass.
+    fn ways_of_one_pass(&self, plane: &Fit, pass: usize) -> Result<Vec<Vector2<f64>>> {
+        let not_a_pass = |still: usize, what: String| {
+            Error::configuration(format!("these stills are not one pass of the board: {what}"))
+                .at(self.stills[still].name)
+                .remedy(
+                    "give the stills of one pass in order of time, of a board that the belt carries \
+                     and nobody touches; stills of the board laid elsewhere go to --elsewhere",
+                )
+        };
+        let covariance = plane
+            .normal
+            .covariance()
+            .ok_or_else(|| Error::failure("the corners do not determine the belt plane"))?
+            * plane.sigma_px().powi(2);
+        let mut ways = vec![Vector2::zeros()];
+        for still in 1..pass {
+            let k = plane.layout.free(still);
+            let turn_deg = plane.parameters[k + 2].to_degrees();
+            let slack_deg = SIGMAS * covariance[(k + 2, k + 2)].sqrt().to_degrees();
+            if turn_deg.abs() > TURN_DEG_MAX.max(slack_deg) {
+                let what = format!("it is turned by {turn_deg:.1} degrees against the first still");
+                return Err(not_a_pass(still, what));
+            }
+            ways.push(Vector2::new(plane.parameters[k], plane.parameters[k + 1]));
+        }
+        let way_mm = ways[pass - 1].norm();
+        if way_mm < 0.5 * self.board.square_mm {
+            let what = format!("it moved only {way_mm:.1} mm from the first still");
+            return Err(not_a_pass(pass - 1, what));
+        }
+        let along = ways[pass - 1] / way_mm;
+        for still in 1..pass {
+            let k = plane.layout.free(still);
+            let sideways_mm = along.perp(&ways[still]).abs();
+            let sigma_mm = covariance[(k, k)].max(covariance[(k + 1, k + 1)]).sqrt();
+            let slack_mm = SIDEWAYS_MM_MAX.max(SIDEWAYS_MAX * way_mm).max(SIGMAS * sigma_mm);
+            if sideways_mm > slack_mm {
+                let what =
+                    format!("it is {sideways_mm:.1} mm beside the line from the first to the last");
+                return Err(not_a_pass(still, what));
+            }
+            if ways[still].dot(&along) <= ways[still - 1].dot(&along) {
+                let what = "it is not further along than the one before".to_owned();
+                return Err(not_a_pass(still, what));
+            }
+        }
+        Ok(ways)
+    }
+}
+
+/// The belt's frame: X along travel, Y to the left, Z up, on the belt under the board.
+///
+/// A board's columns and rows turn clockwise in the image, so its third axis points down.
+fn belt_frame(board: Pose, travel: Option<Vector2<f64>>, thickness_mm: f64) -> Pose {
+    let up = -board.rotation.column(2);
+    let x = match travel {
+        Some(along) => board.rotation * along.push(0.0),
+        // the image's rows, laid on the belt
+        None => (Vector3::x() - up * up.x).normalize(),
+    };
+    let y = up.cross(&x);
+    Pose {
+        rotation: Matrix3::from_columns(&[x, y, up]),
+        translation_mm: board.translation_mm - up * thickness_mm,
+    }
+}

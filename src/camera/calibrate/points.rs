@@ -1,0 +1,175 @@
+//! The pose from surveyed points, when no board is at hand.
+
+use super::homography::{homography, pose_of_plane, pose_of_points};
+use super::least_squares::{Numeric, minimise};
+use super::{Pose, camera_over_belt, reprojection_error};
+use crate::camera::{Camera, Lens};
+use crate::error::{Error, Result};
+use crate::units::RawPx;
+use nalgebra::{DVector, Matrix3, Vector3};
+
+/// A point with known place on or above the belt, and where the camera sees it.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct SurveyedPoint {
+    /// X along travel, Y to the left, Z up from the belt, mm.
+    pub in_belt_mm: Vector3<f64>,
+    /// Its image.
+    pub at: RawPx,
+}
+
+/// A camera from surveyed points.
+#[derive(Clone, Debug)]
+pub struct PointsCalibration {
+    /// Lens and pose; the origin is under the camera.
+    pub camera: Camera,
+    /// Where that origin is in the surveyor's coordinates, mm.
+    pub origin_mm: [f64; 2],
+    /// Root mean square distance of the points from where they should be, px.
+    pub rms_px: f64,
+    /// Distance of each point, px.
+    pub error_px: Vec<f64>,
+    /// Standard deviation of the camera's height above the belt.
+    pub sigma_height_mm: f64,
+    /// Standard deviation of the tilt of the belt plane (the larger of its two directions).
+    pub sigma_tilt_deg: f64,
+    /// Standard deviation of the direction of travel.
+    pub sigma_travel_deg: f64,
+    /// What the technician should know.
+    pub warnings: Vec<String>,
+}
+
+/// Points on one plane, and in space, that determine a pose.
+const COPLANAR_MIN: usize = 4;
+const GENERAL_MIN: usize = 6;
+/// Points are on one plane (or line) when their spread across it is this part of that along.
+const FLAT: f64 = 0.01;
+/// Points off by this many times the median, and px, are doubtful.
+const DOUBTFUL_RATIO: f64 = 4.0;
+const DOUBTFUL_PX: f64 = 1.0;
+const STEPS_MAX: usize = 50;
+
+/// The pose that fits the points best.
+///
+/// # Errors
+/// Too few points, points on one line, or points that no pose explains.
+pub fn calibrate_points(
+    lens: &Lens,
+    image_size_px: [usize; 2],
+    points: &[SurveyedPoint],
+) -> Result<PointsCalibration> {
+    let start = initial(lens, points)?;
+    let errors = |x: &DVector<f64>| {
+        let pose = moved(start, x);
+        let each: Option<Vec<[f64; 2]>> = points
+            .iter()
+            .map(|p| reprojection_error(lens, pose.apply(p.in_belt_mm), p.at))
+            .collect();
+        Some(each?.concat())
+    };
+    let none = || {
+        Error::configuration("no pose explains these points")
+            .remedy("check their order, unit (mm, px) and signs: X along travel, Y left, Z up")
+    };
+    let (fitted, normal) =
+        minimise(Numeric { parameters: DVector::zeros(6), errors }, STEPS_MAX).ok_or_else(none)?;
+    let pose = moved(start, &fitted.parameters);
+    let centre = -(pose.rotation.transpose() * pose.translation_mm);
+    let camera = camera_over_belt(lens, image_size_px, pose);
+    let error_px: Vec<f64> = points
+        .iter()
+        .filter_map(|p| reprojection_error(lens, pose.apply(p.in_belt_mm), p.at))
+        .map(|[x, y]| x.hypot(y))
+        .collect();
+    let rms_px = (normal.cost / points.len() as f64).sqrt();
+    let freedom = (2.0 * points.len() as f64 - 6.0).max(1.0);
+    let covariance = normal.covariance().ok_or_else(none)? * (normal.cost / freedom);
+    let axes: [Vector3<f64>; 3] = std::array::from_fn(|k| pose.rotation.column(k).into_owned());
+    let turn_deg = |axis: &Vector3<f64>| {
+        let turns = covariance.fixed_view::<3, 3>(0, 0);
+        (axis.transpose() * turns * axis)[0].max(0.0).sqrt().to_degrees()
+    };
+    // The camera's height is -Z . (R t); a turn moves it through t.
+    let up = axes[2];
+    let lever = up.cross(&pose.translation_mm);
+    let slopes = DVector::from_iterator(6, lever.iter().chain(up.iter()).copied());
+    let sigma_height_mm = (slopes.transpose() * &covariance * &slopes)[0].max(0.0).sqrt();
+    Ok(PointsCalibration {
+        origin_mm: [centre.x, centre.y],
+        warnings: warnings(points, &error_px),
+        rms_px,
+        error_px,
+        sigma_height_mm,
+        sigma_tilt_deg: turn_deg(&axes[0]).max(turn_deg(&axes[1])),
+        sigma_travel_deg: turn_deg(&axes[2]),
+        camera,
+    })
+}
+
+fn moved(start: Pose, x: &DVector<f64>) -> Pose {
+    start.moved(Vector3::new(x[0], x[1], x[2]), Vector3::new(x[3], x[4], x[5]))
+}
+
+/// The direct linear transform, for points on a plane or in space.
+fn initial(lens: &Lens, points: &[SurveyedPoint]) -> Result<Pose> {
+    let count = points.len();
+    let places: Vec<Vector3<f64>> = points.iter().map(|p| p.in_belt_mm).collect();
+    let centre = places.iter().sum::<Vector3<f64>>() / count.max(1) as f64;
+    let moments: Matrix3<f64> =
+        places.iter().map(|p| (p - centre) * (p - centre).transpose()).sum();
+    let eigen = moments.symmetric_eigen();
+    let mut order = [0, 1, 2];
+    order.sort_by(|&a, &b| eigen.eigenvalues[b].total_cmp(&eigen.eigenvalues[a]));
+    let [long, middle, short] = order.map(|k| eigen.eigenvalues[k].max(0.0).sqrt());
+    let allowed = format!("{COPLANAR_MIN} points on one plane, or {GENERAL_MIN} in space");
+    if count >= 2 && middle <= FLAT * long {
+        return Err(Error::configuration(format!("{count} points on one line"))
+            .allowed(allowed)
+            .remedy("survey points spread over the whole zone, along and across the belt"));
+    }
+    let coplanar = short <= FLAT * middle;
+    let needed = if coplanar { COPLANAR_MIN } else { GENERAL_MIN };
+    if count < needed {
+        let kind = if coplanar { "on one plane" } else { "in space" };
+        return Err(Error::configuration(format!("{count} points {kind}"))
+            .allowed(allowed)
+            .remedy("survey more points, spread over the whole zone"));
+    }
+    let rays: Option<Vec<Vector3<f64>>> = points.iter().map(|p| lens.unproject(p.at)).collect();
+    let rays = rays.ok_or_else(|| {
+        Error::configuration("a point lies where the lens model does not hold")
+            .remedy("check u and v against the image, and that --lens belongs to this camera")
+    })?;
+    let pose = if coplanar {
+        // In the frame of their own plane, which need not be the belt.
+        let axes = order.map(|k| eigen.eigenvectors.column(k).into_owned());
+        let third = axes[0].cross(&axes[1]);
+        let plane_from_belt = Matrix3::from_columns(&[axes[0], axes[1], third]).transpose();
+        let plane: Vec<_> = places.iter().map(|p| (plane_from_belt * (p - centre)).xy()).collect();
+        homography(&plane, &rays).and_then(|h| pose_of_plane(&h)).map(|pose| {
+            let rotation = pose.rotation * plane_from_belt;
+            Pose { rotation, translation_mm: pose.translation_mm - rotation * centre }
+        })
+    } else {
+        pose_of_points(&places, &rays)
+    };
+    pose.ok_or_else(|| {
+        Error::configuration("the points do not determine a pose")
+            .remedy("survey points spread over the whole zone, no three on one line")
+    })
+}
+
+fn warnings(points: &[SurveyedPoint], error_px: &[f64]) -> Vec<String> {
+    let mut sorted = error_px.to_vec();
+    sorted.sort_by(f64::total_cmp);
+    let median = sorted.get(sorted.len() / 2).copied().unwrap_or(0.0);
+    let mut warnings: Vec<String> = error_px
+        .iter()
+        .enumerate()
+        .filter(|&(_, &e)| e > DOUBTFUL_PX.max(DOUBTFUL_RATIO * median))
+        .map(|(k, e)| format!("point {} is {e:.1} px off: check its place and its pixel", k + 1))
+        .collect();
+    if points.len() <= COPLANAR_MIN {
+        warnings.push("so few points cannot check each other: survey more".to_owned());
+    }
+    warnings
+}
