@@ -435,7 +435,7 @@ fn belt_frame(board: Pose, travel: Option<Vector2<f64>>, thickness_mm: f64) -> P
     let x = match travel {
         Some(along) => board.rotation * along.push(0.0),
         // the image's rows, laid on the belt
-        None => (Vector3::x() - up * up.x).normalize(),
+        None => up.cross(&Vector3::y()).normalize(),
     };
     let y = up.cross(&x);
     Pose {

@@ -1,7 +1,7 @@
 //! The pose from surveyed points, when no board is at hand.
 
 use super::homography::{homography, pose_of_plane, pose_of_points};
-use super::least_squares::{Numeric, minimise};
+use super::least_squares::{Normal, Numeric, minimise};
 use super::{Pose, camera_over_belt, reprojection_error};
 use crate::camera::{Camera, Lens};
 use crate::error::{Error, Result};
@@ -43,46 +43,34 @@ const COPLANAR_MIN: usize = 4;
 const GENERAL_MIN: usize = 6;
 /// Points are on one plane (or line) when their spread across it is this part of that along.
 const FLAT: f64 = 0.01;
-/// Points off by this many times the median, and px, are doubtful.
-const DOUBTFUL_RATIO: f64 = 4.0;
-const DOUBTFUL_PX: f64 = 1.0;
+/// A point is wrong when the others agree this much better without it, and it matters (px).
+const WITHOUT_RATIO: f64 = 0.3;
+const DISAGREEMENT_PX: f64 = 1.0;
 const STEPS_MAX: usize = 50;
 
 /// The pose that fits the points best.
 ///
 /// # Errors
-/// Too few points, points on one line, or points that no pose explains.
+/// Too few points, points on one line, points that no pose explains, or one that disagrees with
+/// the others.
 pub fn calibrate_points(
     lens: &Lens,
     image_size_px: [usize; 2],
     points: &[SurveyedPoint],
 ) -> Result<PointsCalibration> {
-    let start = initial(lens, points)?;
-    let errors = |x: &DVector<f64>| {
-        let pose = moved(start, x);
-        let each: Option<Vec<[f64; 2]>> = points
-            .iter()
-            .map(|p| reprojection_error(lens, pose.apply(p.in_belt_mm), p.at))
-            .collect();
-        Some(each?.concat())
-    };
-    let none = || {
-        Error::configuration("no pose explains these points")
-            .remedy("check their order, unit (mm, px) and signs: X along travel, Y left, Z up")
-    };
-    let (fitted, normal) =
-        minimise(Numeric { parameters: DVector::zeros(6), errors }, STEPS_MAX).ok_or_else(none)?;
-    let pose = moved(start, &fitted.parameters);
+    let (pose, normal) = fit(lens, points)?;
+    let rms_px = (normal.cost / points.len() as f64).sqrt();
+    if rms_px > DISAGREEMENT_PX {
+        check_each(lens, points, rms_px)?;
+    }
     let centre = -(pose.rotation.transpose() * pose.translation_mm);
-    let camera = camera_over_belt(lens, image_size_px, pose);
-    let error_px: Vec<f64> = points
+    let error_px = points
         .iter()
         .filter_map(|p| reprojection_error(lens, pose.apply(p.in_belt_mm), p.at))
         .map(|[x, y]| x.hypot(y))
         .collect();
-    let rms_px = (normal.cost / points.len() as f64).sqrt();
     let freedom = (2.0 * points.len() as f64 - 6.0).max(1.0);
-    let covariance = normal.covariance().ok_or_else(none)? * (normal.cost / freedom);
+    let covariance = normal.covariance().ok_or_else(no_pose)? * (normal.cost / freedom);
     let axes: [Vector3<f64>; 3] = std::array::from_fn(|k| pose.rotation.column(k).into_owned());
     let turn_deg = |axis: &Vector3<f64>| {
         let turns = covariance.fixed_view::<3, 3>(0, 0);
@@ -93,16 +81,68 @@ pub fn calibrate_points(
     let lever = up.cross(&pose.translation_mm);
     let slopes = DVector::from_iterator(6, lever.iter().chain(up.iter()).copied());
     let sigma_height_mm = (slopes.transpose() * &covariance * &slopes)[0].max(0.0).sqrt();
+    let mut warnings = Vec::new();
+    if points.len() <= COPLANAR_MIN {
+        warnings.push("so few points cannot check each other: survey more".to_owned());
+    } else if rms_px > DISAGREEMENT_PX {
+        warnings.push(format!(
+            "the points disagree by {rms_px:.1} px: check places, pixels and that --lens is this camera's"
+        ));
+    }
     Ok(PointsCalibration {
+        camera: camera_over_belt(lens, image_size_px, pose),
         origin_mm: [centre.x, centre.y],
-        warnings: warnings(points, &error_px),
         rms_px,
         error_px,
         sigma_height_mm,
         sigma_tilt_deg: turn_deg(&axes[0]).max(turn_deg(&axes[1])),
         sigma_travel_deg: turn_deg(&axes[2]),
-        camera,
+        warnings,
     })
+}
+
+fn no_pose() -> Error {
+    Error::configuration("no pose explains these points")
+        .remedy("check their order, unit (mm, px) and signs: X along travel, Y left, Z up")
+}
+
+/// Closed form, then least squares in the image.
+fn fit(lens: &Lens, points: &[SurveyedPoint]) -> Result<(Pose, Normal)> {
+    let start = initial(lens, points)?;
+    let errors = |x: &DVector<f64>| {
+        let pose = moved(start, x);
+        let each: Option<Vec<[f64; 2]>> = points
+            .iter()
+            .map(|p| reprojection_error(lens, pose.apply(p.in_belt_mm), p.at))
+            .collect();
+        Some(each?.concat())
+    };
+    let numeric = Numeric { parameters: DVector::zeros(6), errors };
+    let (fitted, normal) = minimise(numeric, STEPS_MAX).ok_or_else(no_pose)?;
+    Ok((moved(start, &fitted.parameters), normal))
+}
+
+/// Name the point without which the others agree.
+fn check_each(lens: &Lens, points: &[SurveyedPoint], rms_px: f64) -> Result<()> {
+    let without = |k: usize| {
+        let mut others = points.to_vec();
+        others.remove(k);
+        let (_, normal) = fit(lens, &others).ok()?;
+        // One degree of freedom less, or none: then agreement says nothing.
+        (2 * others.len() > 6 + 2).then(|| (normal.cost / others.len() as f64).sqrt())
+    };
+    let best = (0..points.len())
+        .filter_map(|k| Some((k, without(k)?)))
+        .min_by(|a, b| a.1.total_cmp(&b.1))
+        .filter(|(_, rms)| *rms < WITHOUT_RATIO * rms_px);
+    match best {
+        Some((k, rms)) => Err(Error::configuration(format!(
+            "point {} disagrees with the others: without it their error falls from {rms_px:.2} to {rms:.2} px",
+            k + 1
+        ))
+        .remedy("check its X, Y, Z and its pixel, or leave it out")),
+        None => Ok(()),
+    }
 }
 
 fn moved(start: Pose, x: &DVector<f64>) -> Pose {
@@ -156,20 +196,4 @@ fn initial(lens: &Lens, points: &[SurveyedPoint]) -> Result<Pose> {
         Error::configuration("the points do not determine a pose")
             .remedy("survey points spread over the whole zone, no three on one line")
     })
-}
-
-fn warnings(points: &[SurveyedPoint], error_px: &[f64]) -> Vec<String> {
-    let mut sorted = error_px.to_vec();
-    sorted.sort_by(f64::total_cmp);
-    let median = sorted.get(sorted.len() / 2).copied().unwrap_or(0.0);
-    let mut warnings: Vec<String> = error_px
-        .iter()
-        .enumerate()
-        .filter(|&(_, &e)| e > DOUBTFUL_PX.max(DOUBTFUL_RATIO * median))
-        .map(|(k, e)| format!("point {} is {e:.1} px off: check its place and its pixel", k + 1))
-        .collect();
-    if points.len() <= COPLANAR_MIN {
-        warnings.push("so few points cannot check each other: survey more".to_owned());
-    }
-    warnings
 }

@@ -17,7 +17,7 @@ const PARAMETERS: usize = 10;
 const PIXELS_MIN: usize = 3 * PARAMETERS;
 const STEPS_MAX: usize = 40;
 /// The fit must explain the window but for this part of the contrast (root mean square).
-const RESIDUAL_MAX: f64 = 0.35;
+const RESIDUAL_MAX: f64 = 0.5;
 
 /// A corner further from its start, in steps to the next corner, is another one.
 const MOVED_MAX: f64 = 0.25;

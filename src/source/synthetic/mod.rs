@@ -8,6 +8,7 @@ mod random;
 mod render;
 mod scenario;
 
+pub use random::Random;
 pub use render::Renderer;
 pub use scenario::{Material, Parcel, Scenario};
 
