@@ -8,7 +8,7 @@
 //! ```
 //!
 //! - [`units`], [`error`], [`image`]: what everything speaks.
-//! - [`camera`]: lens, pose and belt view; pure geometry.
+//! - [`camera`]: lens, pose and belt view; their calibration from a chessboard. Pure.
 //! - [`config`]: TOML to a checked [`config::Site`].
 //! - [`plan`]: all memory of the vision path, named and reasoned, in one mapping.
 //! - [`kernel`]: pixel loops on slices. [`stage`]: the steps that own state.

@@ -11,7 +11,7 @@ const MAY_USE: &[(&str, &[&str])] = &[
     ("event", &[]),
     ("belt", &["units"]),
     ("plan", &["error"]),
-    ("camera", &["units", "error"]),
+    ("camera", &["image", "units", "error"]),
     ("config", &["camera", "units", "error"]),
     ("kernel", &["image"]),
     ("stage", &["kernel", "camera", "config", "belt", "plan", "image", "units", "error"]),

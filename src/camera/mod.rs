@@ -1,4 +1,5 @@
-//! Camera geometry: lens, pose over the belt, and the belt view. Pure functions, no state.
+//! Camera geometry: lens, pose over the belt, the belt view, and how to find them with a
+//! chessboard. Pure functions, no state.
 //!
 //! Frames: `camera` is x right, y down, z forward; `belt` is [`crate::units::BeltMm`] plus
 //! height above the belt. A transform is named `target_from_source`.

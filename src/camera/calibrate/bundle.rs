@@ -5,7 +5,7 @@ use super::homography::{homography, pose_of_plane};
 use super::least_squares::{Normal, Problem};
 use crate::camera::chessboard::{Chessboard, Corner};
 use crate::camera::{LENS_PARAMETERS, Lens};
-use nalgebra::{DVector, SMatrix, Vector2, Vector3};
+use nalgebra::{DVector, Vector2, Vector3};
 
 /// A corner as seen in one view.
 #[derive(Clone, Copy, Debug)]
@@ -87,18 +87,22 @@ impl Bundle<'_> {
         let first_pose = self.pose_column(view);
         let mut columns: Vec<usize> =
             (0..LENS_PARAMETERS).chain(first_pose..first_pose + 6).collect();
-        let mut slopes: Vec<SMatrix<f64, 2, 1>> = Vec::with_capacity(columns.len() + 3);
-        slopes.extend(projection.by_lens.column_iter().map(|c| c.into_owned()));
-        slopes.extend(by_turn.column_iter().map(|c| c.into_owned()));
-        slopes.extend(projection.by_point.column_iter().map(|c| c.into_owned()));
+        let by_shape = projection.by_point * pose.rotation;
         if !self.shape_mm.is_empty() {
             let first = LENS_PARAMETERS + 3 * self.board.index(corner);
             columns.extend(first..first + 3);
-            let by_shape = projection.by_point * pose.rotation;
-            slopes.extend(by_shape.column_iter().map(|c| c.into_owned()));
         }
         for axis in 0..2 {
-            let slopes: Vec<f64> = slopes.iter().map(|s| s[axis]).collect();
+            let slopes: Vec<f64> = projection
+                .by_lens
+                .row(axis)
+                .iter()
+                .chain(by_turn.row(axis).iter())
+                .chain(projection.by_point.row(axis).iter())
+                .chain(by_shape.row(axis).iter())
+                .copied()
+                .collect();
+            // Of a flat board the last three have no column.
             normal.add(weight, error[axis], &columns, &slopes);
         }
         Some(())

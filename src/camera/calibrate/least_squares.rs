@@ -40,9 +40,13 @@ impl Normal {
     pub(super) fn covariance(&self) -> Option<DMatrix<f64>> {
         let mut matrix = self.matrix.clone();
         let unused: Vec<usize> = (0..matrix.nrows()).filter(|&k| matrix[(k, k)] == 0.0).collect();
-        unused.iter().for_each(|&k| matrix[(k, k)] = 1.0);
+        for &k in &unused {
+            matrix[(k, k)] = 1.0;
+        }
         let mut covariance = matrix.cholesky()?.inverse();
-        unused.iter().for_each(|&k| covariance[(k, k)] = 0.0);
+        for &k in &unused {
+            covariance[(k, k)] = 0.0;
+        }
         Some(covariance)
     }
 

@@ -162,8 +162,7 @@ fn check_lens(
 ) -> Result<()> {
     let lens = &calibration.lens;
     let sigma = calibration.sigma[0].max(calibration.sigma[1]) / lens.fx_px;
-    // A comparison with NaN must refuse.
-    if !(sigma < FOCAL_SIGMA_MAX) {
+    if sigma.is_nan() || sigma >= FOCAL_SIGMA_MAX {
         return Err(Error::configuration(format!(
             "the views determine the focal length only to {:.1} %",
             100.0 * sigma
@@ -182,7 +181,7 @@ fn check_lens(
         ));
     }
     let aspect = lens.fy_px / lens.fx_px;
-    if !((aspect - 1.0).abs() < ASPECT_MAX && lens.fx_px > 0.0) {
+    if lens.fx_px <= 0.0 || (aspect - 1.0).abs() >= ASPECT_MAX {
         return Err(Error::configuration(format!("fy / fx = {aspect:.3}: no camera is like that"))
             .allowed(format!("{} to {}", 1.0 - ASPECT_MAX, 1.0 + ASPECT_MAX))
             .remedy(
@@ -197,7 +196,7 @@ fn check_lens(
     }
     let [width, height] = image_size_px.map(|s| s as f64);
     let off = [lens.cx_px / width - 0.5, lens.cy_px / height - 0.5].map(f64::abs);
-    if !(off[0] < 0.5 && off[1] < 0.5) {
+    if off[0].max(off[1]) >= 0.5 {
         return Err(Error::configuration(format!(
             "the optical axis would meet the image at ({:.0}, {:.0}), outside it",
             lens.cx_px, lens.cy_px
@@ -266,7 +265,8 @@ fn check_coverage(
     let folded = border.filter(|&p| lens.unproject(p).is_none()).map(radius);
     let fold = folded.fold(f64::INFINITY, f64::min);
     if fold.is_finite() {
-        let what = "the distortion folds back inside the image";
+        let what =
+            format!("the distortion folds back inside the image, {fold:.0} px from its centre");
         // Between the outermost corner and the border nothing was seen.
         if corners().any(|p| lens.unproject(p).is_none()) {
             return Err(Error::configuration(format!("{what}, where the board was seen")).remedy(
@@ -274,8 +274,8 @@ fn check_coverage(
             ));
         }
         warnings.push(format!(
-            "{what}, beyond {seen:.0} px from its centre, where no board was seen: \
-             photograph the board in the corners of the image"
+            "{what}, where no board was seen (only up to {seen:.0} px): photograph it in the corners \
+             of the image"
         ));
     }
     Ok(())

@@ -49,7 +49,9 @@ pub(super) fn grids(
         let cells = grow(smooth, saddles, seed);
         // A lone saddle may still belong to the grid of another seed.
         if cells.len() >= 4 {
-            cells.values().for_each(|&s| in_grid[s] = true);
+            for &s in cells.values() {
+                in_grid[s] = true;
+            }
         }
         let size = cells.len();
         if size >= corners_min {

@@ -146,14 +146,17 @@ impl Chessboard {
             let dark = if upright { refined.contrast } else { -refined.contrast };
             dark_first += parity_sign((column as i32, row as i32)) * dark;
             rightwards += (column as f64 - 0.5 * (self.columns - 1) as f64) * refined.at.x;
-            for k in 0..2 {
-                blurs[k].push(refined.blur_px[if upright { k } else { 1 - k }]);
-            }
+            let [first, second] = refined.blur_px;
+            let [along_columns, along_rows] = &mut blurs;
+            along_columns.push(if upright { first } else { second });
+            along_rows.push(if upright { second } else { first });
             let at = RawPx { x: refined.at.x, y: refined.at.y };
             ordered.push(Corner { column, row, at });
         }
         if (if self.is_symmetric() { rightwards } else { dark_first }) < 0.0 {
-            ordered.iter_mut().for_each(|corner| *corner = self.half_turn(corner));
+            for corner in &mut ordered {
+                *corner = self.half_turn(corner);
+            }
         }
         ordered.sort_by_key(|c| (c.row, c.column));
         Ok(BoardImage { corners: ordered, blur_px: blurs.map(median) })

@@ -9,6 +9,7 @@ use crate::run::calibrate::Shot;
 use crate::source::Still;
 use crate::units::RawPx;
 use nalgebra::Vector3;
+use std::fmt::Write;
 use std::path::Path;
 
 /// Write the report of a lens calibration.
@@ -41,7 +42,8 @@ pub(in crate::run) fn lens(
     page.add(coverage(size_px, kept(), scale));
     page.section(
         "Distortion",
-        "A square grid as the lens shows it. Dotted: without distortion. Numbers: displacement in px.",
+        "A square grid as the lens shows it. Grey: where a pinhole would show a point; red: where the lens \
+         shows it instead, and how many px away.",
     );
     page.add(distortion_grid(size_px, &calibration.lens));
     if !calibration.shape_mm.is_empty() {
@@ -100,13 +102,14 @@ fn error_bars(entries: &[ImageEntry]) -> String {
         let colour = if entry.rejected.is_some() { RED } else { BLUE };
         let value = entry.rms_px.map_or("-".to_owned(), |r| format!("{r:.3} px"));
         let reason = entry.rejected.as_deref().unwrap_or_default();
-        html += &format!(
-            "<tr><td>{}<td class=n>{value}<td><svg width=\"{:.0}\" height=\"12\" style=\"background:{colour}\"></svg> \
-             <span class=bad>{}</span>\n",
+        let _ = writeln!(
+            html,
+            "<tr><td>{}<td class=n>{value}<td><svg width=\"{:.0}\" height=\"12\" \
+             style=\"background:{colour}\"></svg> <span class=bad>{}</span>",
             escaped(&entry.file),
             1.0 + 300.0 * rms / largest,
             escaped(reason)
-        );
+        ); // writing to a String cannot fail
     }
     html + "</table>"
 }
