@@ -454,7 +454,7 @@ impl Problem<'_> {
                 used.polarity[e] += f64::from(slope.signum());
                 let share = residual / gate_mm;
                 let biweight = (1.0 - share * share).powi(2);
-                used.contrast += biweight * f64::from(slope.abs().min(VOTE_SLOPE_MAX));
+                used.contrast += biweight * f64::from(slope.abs()).ln_1p();
                 normal.add(
                     residual,
                     &row,
