@@ -211,6 +211,8 @@ fn surveyed_points_from_a_table() {
     assert!(folder.join("camera.html").exists());
 
     let before = fs::read(folder.join("camera.toml")).expect("written");
+    let html = ["--points", "points.csv", "--lens", "lens.toml", "--out", "camera.html"];
+    refused(&calibrate("belt", &html, &folder), 2, &["camera.html", ".toml"]);
     refused(&run("1,2,3\n"), 2, &["points.csv, line 1", "five numbers"]);
     refused(&run("X,Y,Z,u,v\n1,2,0,3,x\n"), 2, &["line 2"]);
     refused(&run("1,2,0,3,inf\n"), 2, &["line 1"]);
@@ -230,6 +232,13 @@ fn a_lens_file_that_is_none_is_named() {
     fs::write(folder.join("p.csv"), "").expect("writable");
     let arguments = ["--points", "p.csv", "--lens", "lens.toml", "--out", "camera.toml"];
     refused(&calibrate("belt", &arguments, &folder), 2, &["lens.toml", "not a camera calibration"]);
+    let good = fs::read_to_string(write_lens(&folder)).expect("written");
+    for sigma in ["fx_px = nan", "fx_px = -1.0"] {
+        let table =
+            "\n[lens_sigma]\nfy_px = 1\ncx_px = 1\ncy_px = 1\ndistortion = [0, 0, 0, 0, 0]\n";
+        fs::write(folder.join("lens.toml"), format!("{good}{table}{sigma}\n")).expect("writable");
+        refused(&calibrate("belt", &arguments, &folder), 2, &["lens.toml", "lens_sigma"]);
+    }
     let missing = ["--points", "p.csv", "--lens", "no.toml", "--out", "camera.toml"];
     refused(&calibrate("belt", &missing, &folder), 2, &["no.toml", "calibrate lens"]);
 }

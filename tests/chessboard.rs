@@ -163,12 +163,64 @@ fn a_symmetric_board_leads_to_the_right() {
 }
 
 #[test]
-fn a_square_board_is_found() {
-    let board = Chessboard::new([7, 7], 25.0);
-    let lens = pinhole(VGA);
-    let pose = pose(&board, [20.0, 10.0, 12.0], [0.0, 0.0, 400.0]);
-    let found = find(&board, &photograph(&board, &lens, &pose, Shot::sharp(VGA)));
-    assert_eq!(found.map(|f| f.corners.len()), Ok(49));
+fn a_square_board_leads_to_the_right() {
+    for side in [6, 7] {
+        let (board, lens) = (Chessboard::new([side, side], 25.0), pinhole(VGA));
+        for turn in [-80.0, -40.0, 12.0, 54.0, 100.0, 170.0] {
+            let pose = pose(&board, [20.0, 10.0, turn], [0.0, 0.0, 400.0]);
+            let found = find(&board, &photograph(&board, &lens, &pose, Shot::sharp(VGA)))
+                .unwrap_or_else(|e| panic!("{side} {turn}: {e:?}"));
+            assert_eq!(found.corners.len(), side * side);
+            let direction = board.direction(&found.corners);
+            // An odd number of corners tells a quarter turn by its colours, an even one does not.
+            let slack = if side == 7 { 90.0 } else { 45.0 };
+            let off_deg = direction.y.atan2(direction.x).to_degrees().abs();
+            assert!(off_deg < slack + 10.0, "{side} {turn}: {off_deg}"); // perspective
+        }
+    }
+}
+
+#[test]
+fn a_symmetric_board_with_hidden_corners_is_named_alike() {
+    let (board, lens) = (Chessboard::new([8, 6], 25.0), pinhole(VGA));
+    let pose = pose(&board, [0.0, 0.0, 8.0], [-60.0, 0.0, 500.0]);
+    let whole = photograph(&board, &lens, &pose, Shot::sharp(VGA));
+    let expected = find(&board, &whole).expect("a board");
+    for corner in [0, 7] {
+        // A thumb on the end of the first row.
+        let at = expected.corners[corner].at;
+        let mut still = whole.clone();
+        for (k, grey) in still.pixels.iter_mut().enumerate() {
+            let (x, y) = ((k % VGA[0]) as f64, (k / VGA[0]) as f64);
+            if (x - at.x).hypot(y - at.y) < 20.0 {
+                *grey = 128;
+            }
+        }
+        let found = find(&board, &still).expect("a board");
+        assert!(found.corners.len() < 48);
+        for seen in &found.corners {
+            let truth = expected.corners[board.index(seen)].at;
+            assert!((seen.at.x - truth.x).hypot(seen.at.y - truth.y) < 1.0, "{seen:?} {truth:?}");
+        }
+    }
+}
+
+#[test]
+fn the_wanted_board_is_found_beside_a_larger_one() {
+    let lens = pinhole([1280, 720]);
+    let (small, large) = (Chessboard::new([8, 5], 25.0), Chessboard::new([11, 8], 25.0));
+    let left = pose(&small, [5.0, 0.0, 4.0], [-180.0, 0.0, 700.0]);
+    let right = pose(&large, [0.0, 5.0, -3.0], [170.0, 0.0, 800.0]);
+    let soft = Shot { greys: [60.0, 140.0], ..Shot::sharp([1280, 720]) };
+    let mut still = photograph(&small, &lens, &left, soft);
+    let other = photograph(&large, &lens, &right, Shot::sharp([1280, 720]));
+    for (k, grey) in still.pixels.iter_mut().enumerate() {
+        if k % 1280 >= 640 {
+            *grey = other.pixels[k];
+        }
+    }
+    let found = find(&small, &still).expect("the smaller board");
+    assert!(found.corners.iter().all(|c| c.at.x < 640.0));
 }
 
 /// A chessboard is its own mirror image, so nothing can tell; but columns and rows turn

@@ -1,5 +1,6 @@
 //! `camera.toml`: lens and pose as `calibrate` writes them and as a technician may by hand.
 
+use super::calibrate::nearest_rotation;
 use super::{Camera, LENS_PARAMETERS, Lens, LensModel};
 use crate::error::{Error, Result};
 use nalgebra::{Matrix3, Vector3};
@@ -43,7 +44,8 @@ pub(super) struct PoseTable {
 
 /// Six written digits leave this much; a wrong sign or a swapped row leaves more than 1.
 const ROTATION_ERROR_MAX: f64 = 1e-3;
-const IMAGE_SIDE_PX: std::ops::RangeInclusive<usize> = 64..=16384;
+/// Sides of images that are accepted.
+pub const IMAGE_SIDE_PX: std::ops::RangeInclusive<usize> = 64..=16384;
 
 impl CameraFile {
     /// Read and validate a camera file with a pose.
@@ -61,6 +63,9 @@ impl CameraFile {
         let file =
             Self::read(path, "give the file that `beltgauge calibrate lens` wrote with --lens")?;
         let lens = file.checked_lens().map_err(|e| e.in_file(path))?;
+        if let Some(sigma) = &file.lens_sigma {
+            sigma.check(lens.model).map_err(|e| e.in_file(path))?;
+        }
         Ok(CalibratedLens { image_size_px: file.image_size_px, lens, sigma: file.lens_sigma })
     }
 
@@ -89,14 +94,7 @@ impl CameraFile {
         let (camera_from_belt, translation_mm) = pose.into_transform()?;
         let camera =
             Camera { image_size_px: self.image_size_px, lens, camera_from_belt, translation_mm };
-        let height_mm = camera.centre_in_belt().z;
-        if !(50.0..=20_000.0).contains(&height_mm) {
-            return Err(Error::configuration(format!(
-                "pose puts the camera {height_mm:.1} mm above the belt"
-            ))
-            .allowed("50 to 20000 mm, Z up from the belt")
-            .remedy("X_camera = R X_belt + t with t in mm; check its unit and the sign of Z"));
-        }
+        camera.checked_height_mm()?;
         Ok(camera)
     }
 
@@ -130,6 +128,19 @@ impl CalibratedLens {
 }
 
 impl LensSigmaTable {
+    fn check(&self, model: LensModel) -> Result<()> {
+        let all = [self.fx_px, self.fy_px, self.cx_px, self.cy_px];
+        let good = |s: &f64| s.is_finite() && *s >= 0.0;
+        if all.iter().chain(&self.distortion).all(good)
+            && self.distortion.len() == model.distortion_count()
+        {
+            return Ok(());
+        }
+        Err(Error::configuration("lens_sigma is not a table of standard deviations")
+            .allowed("finite numbers, 0 or more, as many as the lens has parameters")
+            .remedy("copy the table as `beltgauge calibrate lens` wrote it, or leave it out"))
+    }
+
     /// From standard deviations in the order of [`Lens::parameters`].
     pub fn new(model: LensModel, sigma: [f64; LENS_PARAMETERS]) -> Self {
         let [fx_px, fy_px, cx_px, cy_px, ..] = sigma;
@@ -203,14 +214,13 @@ impl PoseTable {
             ))
             .remedy("copy all nine numbers with at least 5 digits; check row order and signs"));
         }
-        let svd = written.svd(true, true);
-        let (Some(u), Some(v_t)) = (svd.u, svd.v_t) else {
-            return Err(Error::configuration("pose.rotation has no singular value decomposition"));
-        };
+        let rotation = nearest_rotation(&written).ok_or_else(|| {
+            Error::configuration("pose.rotation has no singular value decomposition")
+        })?;
         let translation = Vector3::from(self.translation_mm);
         if !translation.iter().all(|t| t.is_finite()) {
             return Err(Error::configuration("pose.translation_mm is not finite"));
         }
-        Ok((u * v_t, translation))
+        Ok((rotation, translation))
     }
 }

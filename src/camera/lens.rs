@@ -153,7 +153,7 @@ impl Lens {
     }
 
     /// Image of a point with its derivatives, also where the model folds back: a calibration
-    /// on its way may pass there. `None` behind a brown lens and in the centre of a fisheye.
+    /// on its way may pass there. `None` behind a brown lens and right behind a fisheye.
     pub fn linearise(&self, in_camera: Vector3<f64>) -> Option<Projection> {
         let focal = Matrix2::new(self.fx_px, 0.0, 0.0, self.fy_px);
         let (distorted, by_point, by_distortion) = match self.model {
@@ -196,7 +196,9 @@ impl Lens {
     ) -> Option<(Vector2<f64>, Matrix2x3<f64>, SMatrix<f64, 2, 5>)> {
         let (radius, square) = (at.xy().norm(), at.norm_squared());
         if radius <= 1e-9 * square.sqrt() {
-            return None; // no direction to bend in
+            // On the axis there is no direction to bend in.
+            let by_point = Matrix2x3::identity() / at.z;
+            return (at.z > 0.0).then(|| (at.xy() / at.z, by_point, SMatrix::zeros()));
         }
         let theta = radius.atan2(at.z);
         let outward = at.xy() / radius;

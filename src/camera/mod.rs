@@ -13,12 +13,16 @@ mod lens;
 mod view;
 
 pub use calibration_file::{BeltTable, CalibrationFile, ImageEntry};
-pub use file::{CalibratedLens, CameraFile, LensSigmaTable};
+pub use file::{CalibratedLens, CameraFile, IMAGE_SIDE_PX, LensSigmaTable};
 pub use lens::{LENS_PARAMETERS, Lens, LensModel, Projection};
 pub use view::BeltView;
 
+use crate::error::{Error, Result};
 use crate::units::{BeltMm, RawPx};
 use nalgebra::{Matrix3, Vector3};
+
+/// Where a camera over a belt can be.
+const HEIGHT_MM: std::ops::RangeInclusive<f64> = 50.0..=20_000.0;
 
 /// A calibrated camera above a belt.
 #[derive(Clone, Debug)]
@@ -37,6 +41,22 @@ impl Camera {
     /// Camera centre in the belt frame, mm. z is its height above the belt.
     pub fn centre_in_belt(&self) -> Vector3<f64> {
         -(self.camera_from_belt.transpose() * self.translation_mm)
+    }
+
+    /// The camera's height above the belt, mm.
+    ///
+    /// # Errors
+    /// Where no camera can be, as below the belt.
+    pub fn checked_height_mm(&self) -> Result<f64> {
+        let height_mm = self.centre_in_belt().z;
+        if !HEIGHT_MM.contains(&height_mm) {
+            return Err(Error::configuration(format!(
+                "the camera would be {height_mm:.1} mm above the belt"
+            ))
+            .allowed(format!("{} to {} mm, Z up from the belt", HEIGHT_MM.start(), HEIGHT_MM.end()))
+            .remedy("X_camera = R X_belt + t, lengths in mm: check units, order and signs of what was given"));
+        }
+        Ok(height_mm)
     }
 
     /// Image of a point of the belt frame; `None` behind the camera or beyond the lens model.

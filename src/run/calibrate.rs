@@ -8,8 +8,8 @@ use crate::camera::calibrate::{
 };
 use crate::camera::chessboard::{BoardImage, Chessboard, NotFound};
 use crate::camera::{
-    BeltTable, CalibratedLens, CalibrationFile, Camera, CameraFile, ImageEntry, LensModel,
-    LensSigmaTable,
+    BeltTable, CalibratedLens, CalibrationFile, Camera, CameraFile, IMAGE_SIDE_PX, ImageEntry,
+    LensModel, LensSigmaTable,
 };
 use crate::error::{Error, Result};
 use crate::source::{Still, stills_in};
@@ -42,7 +42,8 @@ pub fn lens(
     out: &Path,
     say: &mut dyn FnMut(&str) -> Result<()>,
 ) -> Result<Vec<String>> {
-    let shots = look(&files_of(images)?, board, say)?;
+    let page = report_beside(out)?;
+    let shots = look(&files_of(images)?, None, board, say)?;
     let size_px = shots[0].still.size_px;
     let found: Vec<BoardImage> = shots.iter().filter_map(|s| s.board.clone().ok()).collect();
     let start = data_sheet.map_or(LensStart::Unknown, |sheet| {
@@ -62,7 +63,7 @@ pub fn lens(
         entries.clone(),
     )
     .save(out, "beltgauge calibrate lens")?;
-    report::lens(&out.with_extension("html"), board, &shots, &entries, &calibration)?;
+    report::lens(&page, board, &shots, &entries, &calibration)?;
     for entry in &entries {
         say(&entry_line(entry))?;
     }
@@ -81,11 +82,12 @@ pub fn belt(
     out: &Path,
     say: &mut dyn FnMut(&str) -> Result<()>,
 ) -> Result<Vec<String>> {
+    let page = report_beside(out)?;
     let lens = CameraFile::load_lens(lens_file)?;
     let carried = files_of(carried)?;
     let elsewhere = files_of(elsewhere)?;
-    let shots = look(&[&carried[..], &elsewhere].concat(), board, say)?;
-    check_size(&lens, shots[0].still.size_px, lens_file)?;
+    let files = [&carried[..], &elsewhere].concat();
+    let shots = look(&files, Some(lens.image_size_px), board, say)?;
     let mut stills = Vec::with_capacity(shots.len());
     for shot in &shots {
         let board_image = shot.board.as_ref().map_err(|reason| {
@@ -95,7 +97,8 @@ pub fn belt(
         })?;
         stills.push(BeltStill { name: &shot.name, board: board_image });
     }
-    let calibration = calibrate_belt(board, &lens, &stills, carried.len(), thickness_mm)?;
+    let (carried, elsewhere) = stills.split_at(carried.len());
+    let calibration = calibrate_belt(board, &lens, carried, elsewhere, thickness_mm)?;
     let entries: Vec<ImageEntry> = shots
         .iter()
         .zip(&calibration.stills)
@@ -115,7 +118,6 @@ pub fn belt(
         &table,
         out,
     )?;
-    let page = out.with_extension("html");
     report::belt(&page, &shots, &table, &calibration)?;
     for entry in &entries {
         say(&entry_line(entry))?;
@@ -131,10 +133,10 @@ pub fn points(
     out: &Path,
     say: &mut dyn FnMut(&str) -> Result<()>,
 ) -> Result<Vec<String>> {
+    let page = report_beside(out)?;
     let lens = CameraFile::load_lens(lens_file)?;
     let points = read_points(csv)?;
-    let calibration =
-        calibrate_points(&lens.lens, lens.image_size_px, &points).map_err(|e| e.in_file(csv))?;
+    let calibration = calibrate_points(&lens, &points).map_err(|e| e.in_file(csv))?;
     let (camera_height_mm, camera_tilt_deg) = height_and_tilt(&calibration.camera);
     let table = BeltTable {
         camera_height_mm,
@@ -151,7 +153,6 @@ pub fn points(
         let at = point.in_belt_mm;
         say(&format!("({:8.1} {:8.1} {:8.1}) mm  {error_px:6.2} px", at.x, at.y, at.z))?;
     }
-    let page = out.with_extension("html");
     report::points(&page, &points, &calibration.error_px, &calibration.camera, &table, &warnings)?;
     say(&belt_summary(&table))?;
     Ok(warnings)
@@ -173,26 +174,15 @@ fn files_of(images: &[PathBuf]) -> Result<Vec<PathBuf>> {
 /// Load every image and look for the board.
 fn look(
     files: &[PathBuf],
+    size_px: Option<[usize; 2]>,
     board: &Chessboard,
     say: &mut dyn FnMut(&str) -> Result<()>,
 ) -> Result<Vec<Shot>> {
     let mut shots: Vec<Shot> = Vec::with_capacity(files.len());
     for (number, path) in files.iter().enumerate() {
+        let expected = size_px.or(shots.first().map(|s| s.still.size_px));
+        check_size(path, Still::size_of(path)?, expected)?;
         let still = Still::load(path)?;
-        if let Some(first) = shots.first()
-            && first.still.size_px != still.size_px
-        {
-            let [width, height] = first.still.size_px;
-            return Err(Error::configuration(format!(
-                "an image of {} x {} px",
-                still.size_px[0], still.size_px[1]
-            ))
-            .in_file(path)
-            .allowed(format!("{width} x {height} px, as {}", first.name))
-            .remedy(
-                "use images of one camera as it delivers them, none cropped, scaled or turned",
-            ));
-        }
         let plane =
             still.plane().ok_or_else(|| Error::failure("an image without pixels").in_file(path))?;
         let found = board.find(plane);
@@ -240,18 +230,11 @@ fn lens_entries(
         .iter()
         .map(|shot| {
             let file = shot.name.clone();
-            match (&shot.board, shot.board.is_ok().then(|| views.next()).flatten()) {
-                (Ok(_), Some(view)) => ImageEntry {
-                    file,
-                    rms_px: view.pose.map(|_| view.rms_px),
-                    rejected: view.rejected.clone(),
-                },
-                (Err(reason), _) => {
-                    let rejected = Some(not_found(board, *reason));
-                    ImageEntry { file, rms_px: None, rejected }
-                }
-                (Ok(_), None) => ImageEntry { file, rms_px: None, rejected: None },
-            }
+            let (rms_px, rejected) = match &shot.board {
+                Err(reason) => (None, Some(not_found(board, *reason))),
+                Ok(_) => views.next().map_or((None, None), |v| (v.rms_px, v.rejected.clone())),
+            };
+            ImageEntry { file, rms_px, rejected }
         })
         .collect()
 }
@@ -288,17 +271,31 @@ fn belt_summary(table: &BeltTable) -> String {
     )
 }
 
-fn check_size(lens: &CalibratedLens, [width, height]: [usize; 2], lens_file: &Path) -> Result<()> {
-    let [lens_width, lens_height] = lens.image_size_px;
-    if [width, height] == lens.image_size_px {
-        return Ok(());
+/// Before an image is decoded: its size must be possible, and that of the others or the lens.
+fn check_size(path: &Path, size_px: [usize; 2], expected: Option<[usize; 2]>) -> Result<()> {
+    let [width, height] = size_px;
+    let wrong = || Error::configuration(format!("an image of {width} x {height} px")).in_file(path);
+    let (from, to) = (IMAGE_SIDE_PX.start(), IMAGE_SIDE_PX.end());
+    match expected {
+        Some([w, h]) if size_px != [w, h] => Err(wrong()
+            .allowed(format!("{w} x {h} px, as the other images and the lens"))
+            .remedy("use images of one camera with one setting, none cropped, scaled or turned")),
+        _ if size_px.iter().any(|side| !IMAGE_SIDE_PX.contains(side)) => {
+            Err(wrong().allowed(format!("sides of {from} to {to} px")))
+        }
+        _ => Ok(()),
     }
-    Err(Error::configuration(format!("the stills have {width} x {height} px"))
-        .in_file(lens_file)
-        .allowed(format!(
-            "{lens_width} x {lens_height} px, the size that the lens was calibrated on"
-        ))
-        .remedy("take the stills with the same camera settings as those for the lens"))
+}
+
+/// The report goes beside the camera file, as .html.
+fn report_beside(out: &Path) -> Result<PathBuf> {
+    let page = out.with_extension("html");
+    if page == out {
+        return Err(Error::configuration("--out would be overwritten by its own report")
+            .in_file(out)
+            .remedy("end the camera file's name in .toml"));
+    }
+    Ok(page)
 }
 
 /// Camera height, mm, and angle between optical axis and the belt's normal, degrees.

@@ -57,31 +57,35 @@ const SIGMAS: f64 = 5.0;
 /// A still's error, lying in the common plane, against that on its own.
 const FLAT_RATIO: f64 = 2.0;
 const FLAT_PX: f64 = 0.3;
+/// Sharp stills through the right lens reach a fifth of this.
+const RMS_PX_WANTED: f64 = 0.5;
 /// A travel direction from a shorter way, in squares, is worth little.
 const TRAVEL_SQUARES_WANTED: f64 = 4.0;
 const STEPS_MAX: usize = 50;
 
 /// The pose of the camera over the belt.
 ///
-/// `stills` are of the board lying flat: first, in order of time, `pass` of them as the belt
-/// carries it, then any number of it laid elsewhere, which make the plane surer. The board's
-/// printed face lies `thickness_mm` above the belt. `focal_sigma` is the relative standard
-/// deviation of the lens's focal length: the height inherits it.
+/// All stills are of the board lying flat: `carried`, in order of time, as the belt carries it,
+/// and `elsewhere` at any other places, which make the plane surer. The board's printed face
+/// lies `thickness_mm` above the belt. The height inherits the uncertainty of the focal length.
 ///
 /// # Errors
-/// Stills that are not one pass of a board lying flat and carried by the belt.
+/// No still; a board whose pose the lens does not give; stills that are not one pass of a board
+/// lying flat and carried by the belt.
 pub fn calibrate_belt(
     board: &Chessboard,
     lens: &CalibratedLens,
-    stills: &[BeltStill<'_>],
-    pass: usize,
+    carried: &[BeltStill<'_>],
+    elsewhere: &[BeltStill<'_>],
     thickness_mm: f64,
 ) -> Result<BeltCalibration> {
-    let named =
-        Stills { board, lens: &lens.lens, stills, corners: same_orientation(board, stills) };
-    let first = named.own_fit(0)?.first;
-    let plane = named.lie_flat(first)?;
-    let fit = if pass > 1 { named.carried(first, &plane, pass)? } else { plane };
+    let pass = carried.len();
+    if pass == 0 {
+        return Err(Error::configuration("no still of the board").remedy("give at least one"));
+    }
+    let stills = Stills::new(board, &lens.lens, &[carried, elsewhere].concat());
+    let (first, plane) = stills.lie_flat()?;
+    let fit = if pass > 1 { stills.carried(first, &plane, pass)? } else { plane };
     let sigma_px = fit.sigma_px();
     let covariance = fit
         .normal
@@ -89,7 +93,7 @@ pub fn calibrate_belt(
         .ok_or_else(|| Error::failure("the corners do not determine the belt plane"))?
         * (sigma_px * sigma_px);
     let camera_of = |x: &DVector<f64>| {
-        let belt = belt_frame(pose_of(first, x), fit.layout.direction(x), thickness_mm);
+        let belt = belt_frame(first.stepped(x), fit.layout.direction(x), thickness_mm);
         camera_over_belt(&lens.lens, lens.image_size_px, belt)
     };
     let camera = camera_of(&fit.parameters);
@@ -109,22 +113,28 @@ pub fn calibrate_belt(
     let turn_deg = |other: &Camera, row: usize, column: usize| {
         (camera.camera_from_belt.transpose() * other.camera_from_belt)[(row, column)].to_degrees()
     };
-    let height_mm = camera.centre_in_belt().z;
+    let height_mm = camera.checked_height_mm()?;
     let ways_mm = fit.layout.ways(&fit.parameters);
     Ok(BeltCalibration {
         rms_px: fit.rms_px(),
         sigma_height_mm: sigma(&|c| c.centre_in_belt().z).hypot(lens.focal_sigma() * height_mm),
         sigma_tilt_deg: sigma(&|c| turn_deg(c, 0, 2)).max(sigma(&|c| turn_deg(c, 1, 2))),
         sigma_travel_deg: (pass > 1).then(|| sigma(&|c| turn_deg(c, 1, 0))),
-        warnings: warnings(board, &ways_mm),
+        warnings: warnings(board, &ways_mm, fit.rms_px()),
         travel_mm: ways_mm,
         stills: fit.stills,
         camera,
     })
 }
 
-fn warnings(board: &Chessboard, ways_mm: &[f64]) -> Vec<String> {
+fn warnings(board: &Chessboard, ways_mm: &[f64], rms_px: f64) -> Vec<String> {
     let mut warnings = Vec::new();
+    if rms_px > RMS_PX_WANTED {
+        warnings.push(format!(
+            "the corners are off by {rms_px:.2} px (rms), a lens that fits reaches 0.1: check that \
+             --lens is this camera's, with this focus, and that the board is flat"
+        ));
+    }
     let way_mm = ways_mm.last().copied().unwrap_or(0.0);
     if ways_mm.len() == 1 {
         warnings.push(
@@ -150,31 +160,6 @@ fn warnings(board: &Chessboard, ways_mm: &[f64]) -> Vec<String> {
         );
     }
     warnings
-}
-
-/// The stills' corners with one name for each: a symmetric board is named from the end that is
-/// nearest to how the first still has it.
-fn same_orientation(board: &Chessboard, stills: &[BeltStill<'_>]) -> Vec<Vec<Corner>> {
-    let direction = |corners: &[Corner]| {
-        corners
-            .iter()
-            .map(|c| {
-                Vector2::new(c.at.x, c.at.y) * (c.column as f64 - 0.5 * (board.columns - 1) as f64)
-            })
-            .sum::<Vector2<f64>>()
-    };
-    let first = stills.first().map_or_else(Vector2::zeros, |s| direction(&s.board.corners));
-    stills
-        .iter()
-        .map(|still| {
-            let corners = &still.board.corners;
-            if board.is_symmetric() && direction(corners).dot(&first) < 0.0 {
-                corners.iter().map(|c| board.half_turn(c)).collect()
-            } else {
-                corners.clone()
-            }
-        })
-        .collect()
 }
 
 /// The parameters of a fit: the first board's turn and shift; of a pass its direction (rad, in
@@ -248,20 +233,24 @@ impl Fit {
     }
 }
 
-/// The first board's pose after a small turn and shift.
-fn pose_of(first: Pose, x: &DVector<f64>) -> Pose {
-    first.moved(Vector3::new(x[0], x[1], x[2]), Vector3::new(x[3], x[4], x[5]))
-}
-
 /// All stills, with one name for each corner.
 struct Stills<'a> {
     board: &'a Chessboard,
     lens: &'a Lens,
-    stills: &'a [BeltStill<'a>],
+    names: Vec<&'a str>,
     corners: Vec<Vec<Corner>>,
 }
 
-impl Stills<'_> {
+impl<'a> Stills<'a> {
+    /// The corners of a symmetric board are named in every still as is nearest to the first.
+    fn new(board: &'a Chessboard, lens: &'a Lens, stills: &[BeltStill<'a>]) -> Self {
+        let first = stills.first().map(|s| board.direction(&s.board.corners));
+        let towards = first.unwrap_or_default();
+        let named = |s: &BeltStill<'_>| board.named_towards(&s.board.corners, towards);
+        let names = stills.iter().map(|s| s.name).collect();
+        Self { board, lens, names, corners: stills.iter().map(named).collect() }
+    }
+
     /// Minimise the distances of all corners of `corners`.
     fn fit(
         &self,
@@ -271,7 +260,7 @@ impl Stills<'_> {
         start: DVector<f64>,
     ) -> Option<Fit> {
         let still_errors = |x: &DVector<f64>, still: usize| -> Option<Vec<f64>> {
-            let pose = pose_of(first, x);
+            let pose = first.stepped(x);
             let mut errors = Vec::with_capacity(2 * corners[still].len());
             for corner in &corners[still] {
                 let at = layout.place(x, still, self.board.place_mm(corner));
@@ -299,7 +288,7 @@ impl Stills<'_> {
             })
         };
         let stills = (0..corners.len()).map(result).collect::<Option<_>>()?;
-        Some(Fit { layout, first: pose_of(first, &parameters), parameters, normal, stills })
+        Some(Fit { layout, first: first.stepped(&parameters), parameters, normal, stills })
     }
 
     /// One still's board on its own.
@@ -313,53 +302,52 @@ impl Stills<'_> {
             })
             .ok_or_else(|| {
                 Error::configuration("the board's corners do not give its pose with this lens")
-                    .at(self.stills[still].name)
+                    .at(self.names[still])
                     .remedy("check that --lens belongs to this camera and its images")
             })
     }
 
-    /// All boards in one plane, each anywhere and turned anyhow in it.
-    fn lie_flat(&self, first: Pose) -> Result<Fit> {
-        let layout = Layout { pass: 1, stills: self.stills.len() };
+    /// The first board's own pose, and all boards in one plane, each anywhere and turned anyhow
+    /// in it.
+    fn lie_flat(&self) -> Result<(Pose, Fit)> {
+        let own: Vec<Fit> =
+            (0..self.names.len()).map(|k| self.own_fit(k)).collect::<Result<_>>()?;
+        let first = own[0].first;
+        let layout = Layout { pass: 1, stills: own.len() };
         let mut start = DVector::zeros(layout.count());
-        let mut own_rms_px = Vec::with_capacity(self.stills.len());
-        for still in 0..self.stills.len() {
-            let own = self.own_fit(still)?;
-            own_rms_px.push(own.rms_px());
-            if still > 0 {
-                let relative = first.rotation.transpose() * own.first.rotation;
-                let shift = own.first.translation_mm - first.translation_mm;
-                let shift = first.rotation.transpose() * shift;
-                let turn = (relative.m21 - relative.m12).atan2(relative.m11 + relative.m22);
-                let k = layout.free(still);
-                start.rows_mut(k, 3).copy_from_slice(&[shift.x, shift.y, turn]);
-            }
+        for (still, own) in own.iter().enumerate().skip(1) {
+            let relative = first.rotation.transpose() * own.first.rotation;
+            let shift = own.first.translation_mm - first.translation_mm;
+            let shift = first.rotation.transpose() * shift;
+            let turn = (relative.m21 - relative.m12).atan2(relative.m11 + relative.m22);
+            let k = layout.free(still);
+            start.rows_mut(k, 3).copy_from_slice(&[shift.x, shift.y, turn]);
         }
         let fit = self
             .fit(layout, first, &self.corners, start)
             .ok_or_else(|| Error::failure("the belt plane does not converge"))?;
-        for (still, (fitted, own_px)) in self.stills.iter().zip(fit.stills.iter().zip(own_rms_px)) {
-            let together_px = fitted.rms_px;
+        for (still, (fitted, own)) in self.names.iter().zip(fit.stills.iter().zip(&own)) {
+            let (together_px, own_px) = (fitted.rms_px, own.rms_px());
             if together_px > FLAT_PX.max(FLAT_RATIO * own_px) {
                 return Err(Error::configuration(format!(
                     "the board does not lie in one plane with the others: \
                      {together_px:.2} px off, {own_px:.2} px on its own"
                 ))
-                .at(still.name)
+                .at(still)
                 .remedy(
                     "lay the board flat on the belt, do not hold it; do not move the camera \
                      between stills",
                 ));
             }
         }
-        Ok(fit)
+        Ok((first, fit))
     }
 
     /// The first `pass` boards on one straight way, turned alike.
     fn carried(&self, first: Pose, plane: &Fit, pass: usize) -> Result<Fit> {
         let ways = self.ways_of_one_pass(plane, pass)?;
         let last = ways[pass - 1];
-        let layout = Layout { pass, stills: self.stills.len() };
+        let layout = Layout { pass, stills: self.names.len() };
         let mut start = DVector::zeros(layout.count());
         start
             .rows_mut(0, Layout::DIRECTION)
@@ -368,7 +356,7 @@ impl Stills<'_> {
         for (k, way) in ways.iter().enumerate().skip(1) {
             start[Layout::DIRECTION + k] = way.dot(&last.normalize());
         }
-        for still in pass..self.stills.len() {
+        for still in pass..self.names.len() {
             let from = plane.parameters.rows(plane.layout.free(still), 3);
             start.rows_mut(layout.free(still), 3).copy_from(&from);
         }
@@ -380,7 +368,7 @@ impl Stills<'_> {
     fn ways_of_one_pass(&self, plane: &Fit, pass: usize) -> Result<Vec<Vector2<f64>>> {
         let not_a_pass = |still: usize, what: String| {
             Error::configuration(format!("these stills are not one pass of the board: {what}"))
-                .at(self.stills[still].name)
+                .at(self.names[still])
                 .remedy(
                     "give the stills of one pass in order of time, of a board that the belt carries \
                      and nobody touches; stills of the board laid elsewhere go to --elsewhere",

@@ -78,7 +78,7 @@ pub(super) fn pose_of_plane(h: &Matrix3<f64>) -> Option<Pose> {
 }
 
 /// The rotation nearest in the Frobenius norm.
-pub(super) fn nearest_rotation(matrix: &Matrix3<f64>) -> Option<Matrix3<f64>> {
+pub(in crate::camera) fn nearest_rotation(matrix: &Matrix3<f64>) -> Option<Matrix3<f64>> {
     let svd = matrix.svd(true, true);
     let (u, v_t) = (svd.u?, svd.v_t?);
     let sign = (u * v_t).determinant().signum();
@@ -134,7 +134,7 @@ pub(super) fn pose_of_points(points: &[Vector3<f64>], rays: &[Vector3<f64>]) -> 
     let h = smallest_eigenvector(&normal, 1e-13)?;
     let matrix = SMatrix::<f64, 3, 4>::from_row_slice(h.as_slice());
     let left = matrix.fixed_view::<3, 3>(0, 0).into_owned();
-    // The constraint fixes the scale, the points' side of the camera its sign.
+    // The constraint fixes the scale; a rotation, not a mirror, its sign.
     let size = left.row(2).norm() * left.determinant().signum();
     let rotation = nearest_rotation(&(left / size))?;
     let translation_mm = matrix.column(3) / size * scale - rotation * centre;

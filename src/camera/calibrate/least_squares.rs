@@ -1,10 +1,10 @@
 //! Levenberg-Marquardt on the normal equations, and its covariance.
 //!
-//! Source: Madsen, Nielsen, Tingleff 2004, Methods for Non-Linear Least Squares Problems, 3.2.
+//! Source: Marquardt 1963: the diagonal is scaled, the damping follows success and failure.
 
 use nalgebra::{DMatrix, DVector};
 
-/// Relative steps smaller than this end the iteration.
+/// A smaller relative gain ends the iteration.
 const CONVERGED: f64 = 1e-10;
 const DAMPING_START: f64 = 1e-3;
 const DAMPING_MAX: f64 = 1e12;
@@ -103,7 +103,7 @@ pub(super) struct Numeric<F> {
     pub(super) errors: F,
 }
 
-/// Of parameters in rad, mm or mm / mm near 1: far above rounding, far below curvature.
+/// Of parameters in rad or mm: far above rounding, far below curvature.
 pub(super) const DIFFERENCE: f64 = 1e-5;
 
 impl<F: Fn(&DVector<f64>) -> Option<Vec<f64>> + Clone> Problem for Numeric<F> {

@@ -31,10 +31,10 @@ pub enum BoardShape {
 /// One view's part in a calibration.
 #[derive(Clone, Debug)]
 pub struct ViewResult {
-    /// Where the board was; `None` when the view was rejected before the fit.
+    /// Where the board was; of a rejected view by the closed form, `None` when that has none.
     pub pose: Option<Pose>,
     /// Root mean square distance of its corners from where they should be, px.
-    pub rms_px: f64,
+    pub rms_px: Option<f64>,
     /// Why it is not part of the result.
     pub rejected: Option<String>,
     /// Each corner and its error (seen minus expected), px; outliers included.
@@ -77,6 +77,8 @@ const SMEAR_PX_MAX: f64 = 8.0;
 const SHAPE_GAIN: f64 = 0.25;
 /// ...and there are enough views to tell shape from lens.
 const SHAPE_VIEWS_MIN: usize = 6;
+/// ...and so few corners that it takes seconds: each adds three parameters.
+const SHAPE_CORNERS_MAX: usize = 200;
 const STEPS_MAX: usize = 60;
 
 /// Calibrate from what was found in each image.
@@ -92,18 +94,24 @@ pub fn calibrate_lens(
     shape: BoardShape,
 ) -> Result<LensCalibration> {
     let mut rejected = verdict::blurred(images, SMEAR_PX_MAX, VIEWS_MIN);
+    let mut found: Option<(Lens, Vec<Pose>)> = None;
     loop {
         let kept: Vec<usize> = (0..images.len()).filter(|&v| rejected[v].is_none()).collect();
         if kept.len() < VIEWS_MIN {
             return Err(verdict::too_few_views(kept.len(), VIEWS_MIN));
         }
-        let mut views: Vec<View> = kept.iter().map(|&v| View::all_of(&images[v])).collect();
-        let first = initial(board, image_size_px, &views, model, start)?;
-        let fitted = fit(&mut views, first, shape)?;
+        let views: Vec<View> = kept.iter().map(|&v| View::all_of(&images[v])).collect();
+        let first = match found.take() {
+            Some(found) => found,
+            None => initial(board, image_size_px, &views, model, start)?,
+        };
+        let mut fitted = fit(board, views, first, shape)?;
         if let Some(worst) = verdict::worst_view(&fitted, VIEW_RATIO, VIEW_RMS_PX)
             && kept.len() > VIEWS_MIN
         {
             rejected[kept[worst]] = Some(verdict::does_not_belong(&fitted, worst));
+            fitted.poses.remove(worst);
+            found = Some((fitted.lens, fitted.poses));
             continue;
         }
         let mut calibration = summarise(board, images, &rejected, &kept, &fitted)?;
@@ -138,14 +146,14 @@ fn initial(
     views: &[View],
     model: LensModel,
     start: LensStart,
-) -> Result<(Chessboard, Lens, Vec<Pose>)> {
+) -> Result<(Lens, Vec<Pose>)> {
     let [width, height] = image_size_px.map(|s| s as f64);
     let centre = [0.5 * (width - 1.0), 0.5 * (height - 1.0)];
     let plain = |focal: [f64; 2], centre| Lens::new(model, focal, centre, [0.0; 5]);
     let candidates = match start {
         LensStart::FocalPx(focal) => vec![plain([focal; 2], centre)],
         LensStart::Unknown => {
-            // From 150 degrees of view to a long telephoto lens, in steps of a sixth.
+            // From the widest lenses to a long telephoto lens, in steps of a sixth.
             let focal = |k: i32| width.max(height) * 0.2 * 1.17_f64.powi(k);
             let mut lenses: Vec<Lens> = (0..20).map(|k| plain([focal(k); 2], centre)).collect();
             if model == LensModel::Brown {
@@ -173,12 +181,15 @@ fn initial(
         }
     }
     let (_, lens, poses) = best.ok_or_else(|| {
-        Error::failure("no lens explains these views").remedy(
-            "check the board's size and square, and that all images are of one camera with one focus; \
-             give --focal-mm and --sensor-width-mm from the data sheet",
-        )
+        let data_sheet = match start {
+            LensStart::Unknown => "give --focal-mm and --sensor-width-mm from the data sheet",
+            LensStart::FocalPx(_) => "check --focal-mm and --sensor-width-mm, or leave them out",
+        };
+        Error::failure("no lens explains these views").remedy(format!(
+            "check the board's size, and that all images are of one camera with one focus; {data_sheet}"
+        ))
     })?;
-    Ok((*board, lens, poses))
+    Ok((lens, poses))
 }
 
 fn closed_form(
@@ -208,8 +219,9 @@ fn closed_form(
 
 /// Fit robustly, find the outliers, decide on the board's shape, fit plainly.
 fn fit(
-    views: &mut Vec<View>,
-    (board, lens, poses): (Chessboard, Lens, Vec<Pose>),
+    board: &Chessboard,
+    mut views: Vec<View>,
+    (lens, poses): (Lens, Vec<Pose>),
     shape: BoardShape,
 ) -> Result<Fitted> {
     let diverged = || {
@@ -218,25 +230,28 @@ fn fit(
         )
     };
     let robust = |views: &[View], lens: Lens, poses: Vec<Pose>, shape_mm, robust_px| {
-        let bundle = Bundle { board: &board, views, lens, poses, shape_mm, robust_px };
+        let bundle = Bundle { board, views, lens, poses, shape_mm, robust_px };
         let (bundle, _) = minimise(bundle, STEPS_MAX)?;
         let sigma_px = sigma_px(&bundle);
         Some((bundle.lens, bundle.poses, bundle.shape_mm, sigma_px))
     };
     // The scale of the errors is not known yet: two passes find it.
     let (lens, poses, _, sigma) =
-        robust(views, lens, poses, Vec::new(), 1.0).ok_or_else(diverged)?;
+        robust(&views, lens, poses, Vec::new(), 1.0).ok_or_else(diverged)?;
     let (mut lens, mut poses, mut shape_mm, mut sigma) =
-        robust(views, lens, poses, Vec::new(), 2.0 * sigma).ok_or_else(diverged)?;
-    if shape == BoardShape::Estimated && views.len() >= SHAPE_VIEWS_MIN {
+        robust(&views, lens, poses, Vec::new(), 2.0 * sigma).ok_or_else(diverged)?;
+    if shape == BoardShape::Estimated
+        && views.len() >= SHAPE_VIEWS_MIN
+        && board.corner_count() <= SHAPE_CORNERS_MAX
+    {
         let start = vec![Vector3::zeros(); board.corner_count()];
-        let shaped = robust(views, lens.clone(), poses.clone(), start, 2.0 * sigma);
+        let shaped = robust(&views, lens.clone(), poses.clone(), start, 2.0 * sigma);
         if let Some(shaped) = shaped.filter(|s| s.3 < (1.0 - SHAPE_GAIN) * sigma) {
             (lens, poses, shape_mm, sigma) = shaped;
         }
     }
     let limit_px = (OUTLIER_SIGMAS * sigma).max(OUTLIER_PX);
-    let bundle = Bundle { board: &board, views, lens, poses, shape_mm, robust_px: f64::INFINITY };
+    let bundle = Bundle { board, views: &views, lens, poses, shape_mm, robust_px: f64::INFINITY };
     let is_outlier = |v: usize, o: &Observation| {
         bundle.residual(v, &o.corner).is_none_or(|r| r.norm() > limit_px)
     };
@@ -251,13 +266,13 @@ fn fit(
             observation.is_outlier = mark && few;
         }
     }
-    let bundle = Bundle { board: &board, views, lens, poses, shape_mm, robust_px: f64::INFINITY };
+    let bundle = Bundle { board, views: &views, lens, poses, shape_mm, robust_px: f64::INFINITY };
     // Before a view that does not belong can bend the plain fit to itself.
     let view_rms_px = (0..views.len()).map(|v| bundle.view_rms_px(v)).collect();
     let (bundle, normal) = minimise(bundle, STEPS_MAX).ok_or_else(diverged)?;
     let rms_px = rms_px(&bundle);
     let Bundle { lens, poses, shape_mm, .. } = bundle;
-    Ok(Fitted { lens, poses, shape_mm, views: views.clone(), rms_px, view_rms_px, normal })
+    Ok(Fitted { lens, poses, shape_mm, views, rms_px, view_rms_px, normal })
 }
 
 /// Robust standard deviation of the corners' distances: that of most, whatever the rest does.
@@ -315,14 +330,13 @@ fn summarise(
                 robust_px: f64::INFINITY,
             };
             let residual = |o: &Observation| {
-                let residual = pose.and_then(|_| bundle.residual(0, &o.corner));
-                (o.corner, residual.unwrap_or_default())
+                pose.and_then(|_| Some((o.corner, bundle.residual(0, &o.corner)?)))
             };
             ViewResult {
                 pose,
-                rms_px: if pose.is_some() { bundle.view_rms_px(0) } else { f64::NAN },
+                rms_px: pose.map(|_| bundle.view_rms_px(0)).filter(|rms| rms.is_finite()),
                 rejected: rejected[v].clone(),
-                residuals: view[0].observations.iter().map(residual).collect(),
+                residuals: view[0].observations.iter().filter_map(residual).collect(),
                 outliers: view[0].observations.iter().filter(|o| o.is_outlier).count(),
             }
         })

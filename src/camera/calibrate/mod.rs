@@ -13,12 +13,13 @@ mod points;
 mod verdict;
 
 pub use belt::{BeltCalibration, BeltStill, StillResult, calibrate_belt};
+pub(super) use homography::nearest_rotation;
 pub use lens::{BoardShape, LensCalibration, LensStart, ViewResult, calibrate_lens};
 pub use points::{PointsCalibration, SurveyedPoint, calibrate_points};
 
 use super::{Camera, Lens};
 use crate::units::RawPx;
-use nalgebra::{Matrix3, Rotation3, Vector3};
+use nalgebra::{DVector, Matrix3, Rotation3, Vector3};
 
 /// Where a board or a belt is: `X_camera = R X + t`.
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -41,6 +42,13 @@ impl Pose {
             rotation: Rotation3::new(turn) * self.rotation,
             translation_mm: self.translation_mm + shift,
         }
+    }
+}
+
+impl Pose {
+    /// [`Pose::moved`] by the first six parameters of a fit: turn, then shift.
+    fn stepped(&self, x: &DVector<f64>) -> Self {
+        self.moved(Vector3::new(x[0], x[1], x[2]), Vector3::new(x[3], x[4], x[5]))
     }
 }
 

@@ -3,7 +3,7 @@
 use super::homography::{homography, pose_of_plane, pose_of_points};
 use super::least_squares::{Normal, Numeric, minimise};
 use super::{Pose, camera_over_belt, reprojection_error};
-use crate::camera::{Camera, Lens};
+use crate::camera::{CalibratedLens, Camera, Lens};
 use crate::error::{Error, Result};
 use crate::units::RawPx;
 use nalgebra::{DVector, Matrix3, Vector3};
@@ -46,6 +46,10 @@ const FLAT: f64 = 0.01;
 /// A point is wrong when the others agree this much better without it, and it matters (px).
 const WITHOUT_RATIO: f64 = 0.3;
 const DISAGREEMENT_PX: f64 = 1.0;
+/// Points that disagree by more, as part of the image's width, are not a survey.
+const DISAGREEMENT_MAX: f64 = 0.01;
+/// A point is picked in an image no better than this.
+const POINTING_PX: f64 = 0.3;
 const STEPS_MAX: usize = 50;
 
 /// The pose that fits the points best.
@@ -54,15 +58,24 @@ const STEPS_MAX: usize = 50;
 /// Too few points, points on one line, points that no pose explains, or one that disagrees with
 /// the others.
 pub fn calibrate_points(
-    lens: &Lens,
-    image_size_px: [usize; 2],
+    calibrated: &CalibratedLens,
     points: &[SurveyedPoint],
 ) -> Result<PointsCalibration> {
+    let CalibratedLens { image_size_px, lens, .. } = calibrated;
+    check_pixels(*image_size_px, points)?;
     let (pose, normal) = fit(lens, points)?;
     let rms_px = (normal.cost / points.len() as f64).sqrt();
     if rms_px > DISAGREEMENT_PX {
         check_each(lens, points, rms_px)?;
     }
+    let disagreement_max_px = DISAGREEMENT_MAX * image_size_px[0] as f64;
+    if rms_px > disagreement_max_px {
+        return Err(Error::configuration(format!("the points disagree by {rms_px:.1} px (rms)"))
+            .allowed(format!("{disagreement_max_px:.0} px; a careful survey reaches 0.5"))
+            .remedy("check places, pixels and signs (X along travel, Y left, Z up), and --lens"));
+    }
+    let camera = camera_over_belt(lens, *image_size_px, pose);
+    let height_mm = camera.checked_height_mm()?;
     let centre = -(pose.rotation.transpose() * pose.translation_mm);
     let error_px = points
         .iter()
@@ -70,17 +83,19 @@ pub fn calibrate_points(
         .map(|[x, y]| x.hypot(y))
         .collect();
     let freedom = (2.0 * points.len() as f64 - 6.0).max(1.0);
-    let covariance = normal.covariance().ok_or_else(no_pose)? * (normal.cost / freedom);
+    // Few points can agree by chance: they are no better than a hand that points at pixels.
+    let variance = (normal.cost / freedom).max(POINTING_PX * POINTING_PX);
+    let covariance = normal.covariance().ok_or_else(no_pose)? * variance;
     let axes: [Vector3<f64>; 3] = std::array::from_fn(|k| pose.rotation.column(k).into_owned());
     let turn_deg = |axis: &Vector3<f64>| {
         let turns = covariance.fixed_view::<3, 3>(0, 0);
         (axis.transpose() * turns * axis)[0].max(0.0).sqrt().to_degrees()
     };
-    // The camera's height is -Z . (R t); a turn moves it through t.
+    // The camera's height is -(R Z) . t; a turn moves it through t.
     let up = axes[2];
     let lever = up.cross(&pose.translation_mm);
     let slopes = DVector::from_iterator(6, lever.iter().chain(up.iter()).copied());
-    let sigma_height_mm = (slopes.transpose() * &covariance * &slopes)[0].max(0.0).sqrt();
+    let of_points = (slopes.transpose() * &covariance * &slopes)[0].max(0.0).sqrt();
     let mut warnings = Vec::new();
     if points.len() <= COPLANAR_MIN {
         warnings.push("so few points cannot check each other: survey more".to_owned());
@@ -90,11 +105,11 @@ pub fn calibrate_points(
         ));
     }
     Ok(PointsCalibration {
-        camera: camera_over_belt(lens, image_size_px, pose),
+        camera,
         origin_mm: [centre.x, centre.y],
         rms_px,
         error_px,
-        sigma_height_mm,
+        sigma_height_mm: of_points.hypot(calibrated.focal_sigma() * height_mm),
         sigma_tilt_deg: turn_deg(&axes[0]).max(turn_deg(&axes[1])),
         sigma_travel_deg: turn_deg(&axes[2]),
         warnings,
@@ -106,20 +121,44 @@ fn no_pose() -> Error {
         .remedy("check their order, unit (mm, px) and signs: X along travel, Y left, Z up")
 }
 
-/// Closed form, then least squares in the image.
+/// Pixels must be in the image: swapped columns are often not.
+fn check_pixels([width, height]: [usize; 2], points: &[SurveyedPoint]) -> Result<()> {
+    let inside =
+        |at: RawPx| (-0.5..width as f64).contains(&at.x) && (-0.5..height as f64).contains(&at.y);
+    match points.iter().position(|p| !inside(p.at)) {
+        None => Ok(()),
+        Some(k) => Err(Error::configuration(format!(
+            "point {} is at pixel ({}, {}), outside the image",
+            k + 1,
+            points[k].at.x,
+            points[k].at.y
+        ))
+        .allowed(format!("u below {width}, v below {height}"))
+        .remedy("give X, Y, Z in mm, then u (column) and v (row) in px")),
+    }
+}
+
+/// Closed forms, then least squares in the image from each: the best.
 fn fit(lens: &Lens, points: &[SurveyedPoint]) -> Result<(Pose, Normal)> {
-    let start = initial(lens, points)?;
-    let errors = |x: &DVector<f64>| {
-        let pose = moved(start, x);
-        let each: Option<Vec<[f64; 2]>> = points
-            .iter()
-            .map(|p| reprojection_error(lens, pose.apply(p.in_belt_mm), p.at))
-            .collect();
-        Some(each?.concat())
+    let errors_from = |start: Pose| {
+        move |x: &DVector<f64>| {
+            let pose = start.stepped(x);
+            let each: Option<Vec<[f64; 2]>> = points
+                .iter()
+                .map(|p| reprojection_error(lens, pose.apply(p.in_belt_mm), p.at))
+                .collect();
+            Some(each?.concat())
+        }
     };
-    let numeric = Numeric { parameters: DVector::zeros(6), errors };
-    let (fitted, normal) = minimise(numeric, STEPS_MAX).ok_or_else(no_pose)?;
-    Ok((moved(start, &fitted.parameters), normal))
+    initial(lens, points)?
+        .into_iter()
+        .filter_map(|start| {
+            let numeric = Numeric { parameters: DVector::zeros(6), errors: errors_from(start) };
+            let (fitted, normal) = minimise(numeric, STEPS_MAX)?;
+            Some((start.stepped(&fitted.parameters), normal))
+        })
+        .min_by(|a, b| a.1.cost.total_cmp(&b.1.cost))
+        .ok_or_else(no_pose)
 }
 
 /// Name the point without which the others agree.
@@ -145,12 +184,9 @@ fn check_each(lens: &Lens, points: &[SurveyedPoint], rms_px: f64) -> Result<()> 
     }
 }
 
-fn moved(start: Pose, x: &DVector<f64>) -> Pose {
-    start.moved(Vector3::new(x[0], x[1], x[2]), Vector3::new(x[3], x[4], x[5]))
-}
-
-/// The direct linear transform, for points on a plane or in space.
-fn initial(lens: &Lens, points: &[SurveyedPoint]) -> Result<Pose> {
+/// Starts: the points taken as on their main plane, and the direct linear transform, which
+/// needs them well off it.
+fn initial(lens: &Lens, points: &[SurveyedPoint]) -> Result<Vec<Pose>> {
     let count = points.len();
     let places: Vec<Vector3<f64>> = points.iter().map(|p| p.in_belt_mm).collect();
     let centre = places.iter().sum::<Vector3<f64>>() / count.max(1) as f64;
@@ -179,21 +215,15 @@ fn initial(lens: &Lens, points: &[SurveyedPoint]) -> Result<Pose> {
         Error::configuration("a point lies where the lens model does not hold")
             .remedy("check u and v against the image, and that --lens belongs to this camera")
     })?;
-    let pose = if coplanar {
-        // In the frame of their own plane, which need not be the belt.
-        let axes = order.map(|k| eigen.eigenvectors.column(k).into_owned());
-        let third = axes[0].cross(&axes[1]);
-        let plane_from_belt = Matrix3::from_columns(&[axes[0], axes[1], third]).transpose();
-        let plane: Vec<_> = places.iter().map(|p| (plane_from_belt * (p - centre)).xy()).collect();
-        homography(&plane, &rays).and_then(|h| pose_of_plane(&h)).map(|pose| {
-            let rotation = pose.rotation * plane_from_belt;
-            Pose { rotation, translation_mm: pose.translation_mm - rotation * centre }
-        })
-    } else {
-        pose_of_points(&places, &rays)
-    };
-    pose.ok_or_else(|| {
-        Error::configuration("the points do not determine a pose")
-            .remedy("survey points spread over the whole zone, no three on one line")
-    })
+    // The plane need not be the belt.
+    let axes = order.map(|k| eigen.eigenvectors.column(k).into_owned());
+    let third = axes[0].cross(&axes[1]);
+    let plane_from_belt = Matrix3::from_columns(&[axes[0], axes[1], third]).transpose();
+    let plane: Vec<_> = places.iter().map(|p| (plane_from_belt * (p - centre)).xy()).collect();
+    let flat = homography(&plane, &rays).and_then(|h| pose_of_plane(&h)).map(|pose| {
+        let rotation = pose.rotation * plane_from_belt;
+        Pose { rotation, translation_mm: pose.translation_mm - rotation * centre }
+    });
+    let general = if coplanar { None } else { pose_of_points(&places, &rays) };
+    Ok(flat.into_iter().chain(general).collect())
 }

@@ -1,7 +1,7 @@
 //! What is wrong with a calibration, in plain words, and what to photograph next.
 
 use super::lens::{Fitted, LensCalibration, LensStart};
-use crate::camera::chessboard::{BoardImage, Chessboard};
+use crate::camera::chessboard::{BoardImage, Chessboard, median};
 use crate::error::{Error, Result};
 use crate::units::RawPx;
 use nalgebra::Vector3;
@@ -72,7 +72,7 @@ pub(super) fn blurred(
 pub(super) fn worst_view(fitted: &Fitted, ratio: f64, rms_px_min: f64) -> Option<usize> {
     let rms = &fitted.view_rms_px;
     let worst = (0..rms.len()).max_by(|&a, &b| rms[a].total_cmp(&rms[b]))?;
-    (rms[worst] > (ratio * median(rms)).max(rms_px_min)).then_some(worst)
+    (rms[worst] > (ratio * median(rms.clone())).max(rms_px_min)).then_some(worst)
 }
 
 pub(super) fn does_not_belong(fitted: &Fitted, view: usize) -> String {
@@ -80,14 +80,8 @@ pub(super) fn does_not_belong(fitted: &Fitted, view: usize) -> String {
     format!(
         "error of {:.2} px where the others have {:.2} px: moved, blurred, or not this board",
         rms[view],
-        median(rms)
+        median(rms.clone())
     )
-}
-
-fn median(values: &[f64]) -> f64 {
-    let mut sorted = values.to_vec();
-    sorted.sort_by(f64::total_cmp);
-    sorted.get(sorted.len() / 2).copied().unwrap_or(0.0)
 }
 
 /// Refuse what cannot be, and add warnings about what is doubtful.
@@ -115,10 +109,17 @@ fn check_views(
     warnings: &mut Vec<String>,
 ) -> Result<()> {
     if 2 * kept.len() <= images.len() {
+        let reasons: Vec<String> = calibration
+            .views
+            .iter()
+            .enumerate()
+            .filter_map(|(v, view)| Some(format!("view {}: {}", v + 1, view.rejected.as_ref()?)))
+            .collect();
         return Err(Error::configuration(format!(
-            "{} of {} views do not belong together",
-            images.len() - kept.len(),
-            images.len()
+            "{} of {} views are of no use: {}",
+            reasons.len(),
+            images.len(),
+            reasons.join("; ")
         ))
         .remedy(
             "use images of one board from one camera with one focus and zoom; \
@@ -181,7 +182,10 @@ fn check_lens(
         ));
     }
     let aspect = lens.fy_px / lens.fx_px;
-    if lens.fx_px <= 0.0 || (aspect - 1.0).abs() >= ASPECT_MAX {
+    if lens.fx_px <= 0.0 || lens.fy_px <= 0.0 {
+        return Err(undetermined());
+    }
+    if (aspect - 1.0).abs() >= ASPECT_MAX {
         return Err(Error::configuration(format!("fy / fx = {aspect:.3}: no camera is like that"))
             .allowed(format!("{} to {}", 1.0 - ASPECT_MAX, 1.0 + ASPECT_MAX))
             .remedy(

@@ -14,11 +14,12 @@ pub(super) struct Corners(HashMap<Cell, Refined>);
 
 impl Corners {
     /// Fit the corners of a grid that was found in an image halved `halvings` times.
-    pub(super) fn refined(image: &Grey, grid: &Grid, halvings: u32) -> Self {
-        let scale = f64::from(1u32 << halvings);
+    pub(super) fn refined(image: &Grey, grid: &Grid, halvings: usize) -> Self {
+        let scale = (1u64 << halvings) as f64;
         let shift = Vector2::repeat(0.5 * (scale - 1.0));
         let grid: Grid = grid.iter().map(|(&cell, at)| (cell, scale * at + shift)).collect();
-        let fit = |(&cell, &at)| Some((cell, refine(image, at, steps(&grid, cell)?)?));
+        let place = |cell: Cell| grid.get(&cell).copied();
+        let fit = |(&cell, &at)| Some((cell, refine(image, at, steps(place, cell)?)?));
         let mut corners = Self(grid.iter().filter_map(fit).collect());
         let typical = corners.median_contrast();
         corners.0.retain(|&cell, c| parity_sign(cell) * c.contrast / typical > CONTRAST_MIN);
@@ -95,9 +96,8 @@ impl Corners {
             return None;
         }
         let place = places.iter().sum::<Vector2<f64>>() / places.len() as f64;
-        let mut grid: Grid = self.0.iter().map(|(&cell, c)| (cell, c.at)).collect();
-        grid.insert((x, y), place);
-        Some((place, steps(&grid, (x, y))?))
+        let steps = steps(|cell| if cell == (x, y) { Some(place) } else { at(cell) }, (x, y))?;
+        Some((place, steps))
     }
 
     /// Cut off border lines of which less than half is seen: they are not the board's.
@@ -126,11 +126,11 @@ impl Corners {
 }
 
 /// Steps to the nearer neighbours along columns and rows: they bound the window.
-fn steps(grid: &Grid, (x, y): Cell) -> Option<[Vector2<f64>; 2]> {
-    let own = grid.get(&(x, y))?;
+fn steps(place: impl Fn(Cell) -> Option<Vector2<f64>>, (x, y): Cell) -> Option<[Vector2<f64>; 2]> {
+    let own = place((x, y))?;
     let step = |dx: i32, dy: i32| {
-        let ahead = grid.get(&(x + dx, y + dy)).map(|p| p - own);
-        let behind = grid.get(&(x - dx, y - dy)).map(|p| own - p);
+        let ahead = place((x + dx, y + dy)).map(|p| p - own);
+        let behind = place((x - dx, y - dy)).map(|p| own - p);
         match (ahead, behind) {
             (Some(a), Some(b)) => Some(if a.norm() < b.norm() { a } else { b }),
             (a, b) => a.or(b),
@@ -145,7 +145,7 @@ pub(super) fn parity_sign((x, y): Cell) -> f64 {
 }
 
 /// The middle value; 0 of none.
-pub(super) fn median(mut values: Vec<f64>) -> f64 {
+pub(in crate::camera) fn median(mut values: Vec<f64>) -> f64 {
     values.sort_by(f64::total_cmp);
     values.get(values.len() / 2).copied().unwrap_or(0.0)
 }

@@ -19,6 +19,8 @@ const EDGE_CONTRAST_MIN: f64 = 0.25;
 const EDGE_GREY_MIN: f64 = 1.5;
 /// Contrast and sharpness change slowly over a board: a neighbour has this part of the strength.
 const STRENGTH_RATIO_MIN: f32 = 0.35;
+/// And this part of the strongest: what lies around a board is smoother.
+const SEED_RATIO_MIN: f32 = 0.03;
 /// Grids are grown from this many saddles, the strongest that no grid holds yet.
 const SEEDS_MAX: usize = 300;
 
@@ -30,8 +32,8 @@ pub(super) type Grid = HashMap<Cell, Vector2<f64>>;
 
 const NEIGHBOURS: [Cell; 4] = [(1, 0), (0, 1), (-1, 0), (0, -1)];
 
-/// The grids that hold at least `corners_min` saddles, the largest first; the search ends with
-/// one of `corners_wanted`.
+/// The grids that hold at least `corners_min` saddles, those of about `corners_wanted` first; the
+/// search ends with one of exactly so many.
 pub(super) fn grids(
     smooth: &Grey,
     saddles: &[Saddle],
@@ -46,7 +48,7 @@ pub(super) fn grids(
             continue;
         }
         seeds += 1;
-        let cells = grow(smooth, saddles, seed);
+        let cells = grow(smooth, saddles, seed, in_grid.clone());
         // A lone saddle may still belong to the grid of another seed.
         if cells.len() >= 4 {
             for &s in cells.values() {
@@ -57,18 +59,26 @@ pub(super) fn grids(
         if size >= corners_min {
             grids.push(cells.into_iter().map(|(cell, s)| (cell, saddles[s].at)).collect());
         }
-        if size >= corners_wanted {
+        if size == corners_wanted {
             break;
         }
     }
-    grids.sort_by_key(|g: &Grid| std::cmp::Reverse(g.len()));
+    grids.sort_by_key(|g: &Grid| g.len().abs_diff(corners_wanted));
     grids
 }
 
 /// Breadth-first from `seed`; a saddle is used once, a cell is filled once.
-fn grow(smooth: &Grey, saddles: &[Saddle], seed: usize) -> HashMap<Cell, usize> {
+fn grow(
+    smooth: &Grey,
+    saddles: &[Saddle],
+    seed: usize,
+    mut used: Vec<bool>,
+) -> HashMap<Cell, usize> {
     let mut cells = HashMap::from([((0, 0), seed)]);
-    let mut used = vec![false; saddles.len()];
+    let strength_min = SEED_RATIO_MIN * saddles[seed].strength;
+    for (used, saddle) in used.iter_mut().zip(saddles) {
+        *used |= saddle.strength < strength_min;
+    }
     used[seed] = true;
     let mut queue = VecDeque::from([(0, 0)]);
     while let Some(cell) = queue.pop_front() {

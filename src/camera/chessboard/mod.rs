@@ -11,7 +11,8 @@ mod saddle;
 
 use crate::image::Plane;
 use crate::units::RawPx;
-use corners::{Corners, median, parity_sign};
+pub(super) use corners::median;
+use corners::{Corners, parity_sign};
 use grey::Grey;
 use nalgebra::Vector2;
 
@@ -68,7 +69,7 @@ const FIRST_PX: usize = 1100;
 /// So many of the board's corners must be seen: the rest may be hidden by glare or a hand.
 const SEEN_MIN: f64 = 0.9;
 /// Grids looked at more closely at each size of the image, the largest first.
-const GRIDS_MAX: usize = 3;
+const GRIDS_MAX: usize = 6;
 
 impl Chessboard {
     /// A board; the order of the two counts does not matter.
@@ -92,8 +93,8 @@ impl Chessboard {
         self.square_mm * Vector2::new(corner.column as f64, corner.row as f64)
     }
 
-    /// Whether the pattern looks the same after half a turn: then its corners cannot be told
-    /// from their opposites.
+    /// Whether the pattern looks the same after half a turn (a square one perhaps after a
+    /// quarter): then its corners cannot be told from their opposites.
     pub fn is_symmetric(&self) -> bool {
         (self.columns + self.rows).is_multiple_of(2)
     }
@@ -105,17 +106,17 @@ impl Chessboard {
     pub fn find(&self, image: Plane<'_>) -> Result<BoardImage, NotFound> {
         let full = Grey::new(image);
         let mut failure = NotFound::NoGrid;
+        let mut pyramid = vec![full];
         for halvings in search_order(image.width().max(image.height())) {
-            let mut small = (halvings > 0).then(|| full.halved());
-            for _ in 1..halvings {
-                small = small.map(|s| s.halved());
+            while pyramid.len() <= halvings {
+                pyramid.push(pyramid[pyramid.len() - 1].halved());
             }
-            let smooth = small.as_ref().unwrap_or(&full).smoothed();
+            let (full, smooth) = (&pyramid[0], pyramid[halvings].smoothed());
             let saddles = saddle::saddles(&smooth);
             let all = self.corner_count();
             for grid in grid::grids(&smooth, &saddles, all / 4, all).iter().take(GRIDS_MAX) {
-                let mut corners = Corners::refined(&full, grid, halvings);
-                corners.complete(&full, [self.columns, self.rows]);
+                let mut corners = Corners::refined(full, grid, halvings);
+                corners.complete(full, [self.columns, self.rows]);
                 match self.ordered(&corners) {
                     Ok(found) => return Ok(found),
                     Err(reason) => failure = failure.nearer(reason),
@@ -139,13 +140,12 @@ impl Chessboard {
         let upright = width >= height;
         let [first, _] = corners.bounds();
         let mut ordered = Vec::with_capacity(seen);
-        let (mut blurs, mut dark_first, mut rightwards) = ([Vec::new(), Vec::new()], 0.0, 0.0);
+        let (mut blurs, mut dark_first) = ([Vec::new(), Vec::new()], 0.0);
         for ((x, y), refined) in corners.iter() {
             let (x, y) = ((x - first.0) as usize, (y - first.1) as usize);
             let (column, row) = if upright { (x, y) } else { (y, width - 1 - x) };
             let dark = if upright { refined.contrast } else { -refined.contrast };
             dark_first += parity_sign((column as i32, row as i32)) * dark;
-            rightwards += (column as f64 - 0.5 * (self.columns - 1) as f64) * refined.at.x;
             let [first, second] = refined.blur_px;
             let [along_columns, along_rows] = &mut blurs;
             along_columns.push(if upright { first } else { second });
@@ -153,22 +153,45 @@ impl Chessboard {
             let at = RawPx { x: refined.at.x, y: refined.at.y };
             ordered.push(Corner { column, row, at });
         }
-        if (if self.is_symmetric() { rightwards } else { dark_first }) < 0.0 {
-            for corner in &mut ordered {
-                *corner = self.half_turn(corner);
-            }
+        if dark_first < 0.0 {
+            let turns = if self.columns == self.rows { 1 } else { 2 };
+            ordered = self.turned(&ordered, turns);
         }
+        let mut ordered = self.named_towards(&ordered, Vector2::x());
         ordered.sort_by_key(|c| (c.row, c.column));
         Ok(BoardImage { corners: ordered, blur_px: blurs.map(median) })
     }
 
-    /// The same corner when the board is named from the opposite end.
-    pub fn half_turn(&self, corner: &Corner) -> Corner {
-        Corner {
-            column: self.columns - 1 - corner.column,
-            row: self.rows - 1 - corner.row,
-            at: corner.at,
-        }
+    /// The corners under those of the names that the pattern allows whose columns lead furthest
+    /// in a direction of the image.
+    pub fn named_towards(&self, corners: &[Corner], towards: Vector2<f64>) -> Vec<Corner> {
+        let turns: &[usize] = match (self.columns == self.rows, self.is_symmetric()) {
+            (true, _) if self.columns.is_multiple_of(2) => &[0, 1, 2, 3],
+            (_, true) => &[0, 2],
+            (_, false) => &[0],
+        };
+        let reach = |turns: usize| self.direction(&self.turned(corners, turns)).dot(&towards);
+        let best = turns.iter().max_by(|&&a, &&b| reach(a).total_cmp(&reach(b)));
+        self.turned(corners, best.copied().unwrap_or(0))
+    }
+
+    /// Where the columns lead in the image; its length says nothing.
+    pub fn direction(&self, corners: &[Corner]) -> Vector2<f64> {
+        let middle = corners.iter().map(|c| c.column as f64).sum::<f64>() / corners.len() as f64;
+        corners.iter().map(|c| (c.column as f64 - middle) * Vector2::new(c.at.x, c.at.y)).sum()
+    }
+
+    /// The corners named from the board turned by quarter turns; by two only, unless its sides
+    /// are equal.
+    fn turned(&self, corners: &[Corner], quarter_turns: usize) -> Vec<Corner> {
+        let (last_column, last_row) = (self.columns - 1, self.rows - 1);
+        let name = |Corner { column, row, at }: Corner| match quarter_turns {
+            1 => Corner { column: row, row: last_column - column, at },
+            2 => Corner { column: last_column - column, row: last_row - row, at },
+            3 => Corner { column: last_row - row, row: column, at },
+            _ => Corner { column, row, at },
+        };
+        corners.iter().copied().map(name).collect()
     }
 }
 
@@ -186,8 +209,8 @@ impl NotFound {
 }
 
 /// How often the image is halved, in the order of trying: the middle size, finer ones, coarser.
-fn search_order(longer_side_px: usize) -> Vec<u32> {
-    let halvings = |target: usize| (longer_side_px / target).max(1).ilog2();
+fn search_order(longer_side_px: usize) -> Vec<usize> {
+    let halvings = |target: usize| (longer_side_px / target).max(1).ilog2() as usize;
     let (first, coarsest) = (halvings(FIRST_PX), halvings(COARSEST_PX));
     (0..=first).rev().chain(first + 1..=coarsest).collect()
 }

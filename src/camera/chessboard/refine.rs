@@ -15,7 +15,7 @@ const WINDOW_PX_MAX: f64 = 16.0;
 const PARAMETERS: usize = 10;
 /// A fit with fewer pixels a parameter than three says nothing.
 const PIXELS_MIN: usize = 3 * PARAMETERS;
-const STEPS_MAX: usize = 40;
+const STEPS_MAX: usize = 25;
 /// The fit must explain the window but for this part of the contrast (root mean square).
 const RESIDUAL_MAX: f64 = 0.5;
 
