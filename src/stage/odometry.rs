@@ -30,7 +30,7 @@ const LOCKED_SEARCH_PX: f64 = 1.5;
 const PEAK_HALF: isize = 4;
 const PEAK_SHIFTS: usize = 2 * PEAK_HALF as usize + 1;
 /// Half width of the window whose mean is taken out of the texture.
-const SHADING_PX: usize = 5;
+const SHADING_PX: usize = 16;
 /// A correlation above this is a match: 200 x 800 px of pure noise stay below 0.02.
 const MATCH_MIN: f64 = 0.08;
 /// Pairs of textured pixels below which a match proves nothing.
@@ -249,6 +249,9 @@ impl Odometry {
     }
 }
 
+/// The interpolated peak is looked for in steps of this many px.
+const FINE_PX: f64 = 0.05;
+
 /// Offset of the peak from the middle of correlations at neighbouring shifts; `None` when it
 /// is not within a pixel.
 fn peak(around: &[f64; PEAK_SHIFTS]) -> Option<f64> {
@@ -263,15 +266,14 @@ fn peak(around: &[f64; PEAK_SHIFTS]) -> Option<f64> {
         });
         terms.sum()
     };
-    const FINE: f64 = 0.05;
     let best = (-19..=19)
-        .map(|k| (k, at(f64::from(k) * FINE)))
+        .map(|k| (k, at(f64::from(k) * FINE_PX)))
         .max_by(|a, b| a.1.total_cmp(&b.1))
-        .map(|(k, _)| f64::from(k) * FINE)?;
-    let (before, here, after) = (at(best - FINE), at(best), at(best + FINE));
+        .map(|(k, _)| f64::from(k) * FINE_PX)?;
+    let (before, here, after) = (at(best - FINE_PX), at(best), at(best + FINE_PX));
     let curvature = before - 2.0 * here + after;
     let is_peak = curvature < 0.0 && before <= here && after <= here;
-    is_peak.then(|| best + 0.5 * FINE * (before - after) / curvature)
+    is_peak.then(|| best + 0.5 * FINE_PX * (before - after) / curvature)
 }
 
 /// Take the local mean out of a row of texture: shading that a parcel's height makes move faster

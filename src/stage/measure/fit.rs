@@ -26,9 +26,9 @@ const GATES_PX: [f64; 12] = [6.0, 6.0, 5.0, 4.0, 3.0, 2.5, 2.0, 2.0, 2.0, 2.0, 2
 const POLARITY_GATE_PX: f64 = 5.0;
 /// Votes on where a face's top edge is, relative to the silhouette's: bins of half a pixel,
 /// from well inside (shadows and dark sides widen a silhouette) to a little outside.
-const VOTE_BINS: usize = 60;
+const VOTE_BINS: usize = 76;
 const VOTE_BIN_PX: f64 = 0.5;
-const VOTE_FIRST_PX: f64 = -22.0;
+const VOTE_FIRST_PX: f64 = -30.0;
 /// Steeper than this votes no more: a label must not outvote an edge.
 const VOTE_SLOPE_MAX: f32 = 4.0;
 /// The outermost place with this share of the most votes is the edge; stripes lie inside it.

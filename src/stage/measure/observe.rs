@@ -14,7 +14,7 @@ pub const SAMPLES_PER_EDGE: usize = 8;
 /// Steps kept of one profile.
 pub const STEPS: usize = 6;
 /// Profiles reach this far to both sides of the predicted edge, px.
-const SEARCH_PX: usize = 24;
+const SEARCH_PX: usize = 32;
 /// Profiles are the mean of this many neighbours to both sides.
 const PROFILE_HALF_WIDTH: i32 = 1;
 /// Weaker steps than this, grey levels a px, drown in sensor noise.
