@@ -109,7 +109,7 @@ enum Calibrate {
         #[arg(long, value_parser = positive, required_unless_present = "points")]
         square_mm: Option<f64>,
         /// How far the board's printed face lies above the belt.
-        #[arg(long, default_value_t = 0.0, value_parser = not_negative)]
+        #[arg(long, default_value_t = 0.0, value_parser = thickness)]
         board_thickness_mm: f64,
         /// Instead of stills: surveyed points, a line each: X,Y,Z in mm, u,v in px.
         #[arg(long, conflicts_with_all = ["images", "board", "square_mm", "board_thickness_mm"])]
@@ -148,14 +148,16 @@ fn board_size(text: &str) -> std::result::Result<[usize; 2], String> {
 }
 
 fn positive(text: &str) -> std::result::Result<f64, String> {
-    let value = not_negative(text)?;
-    if value > 0.0 { Ok(value) } else { Err("give a number of mm above 0".to_owned()) }
+    match text.parse::<f64>() {
+        Ok(value) if value > 0.0 && value <= 10_000.0 => Ok(value),
+        _ => Err("give a number of mm above 0, at most 10000".to_owned()),
+    }
 }
 
-fn not_negative(text: &str) -> std::result::Result<f64, String> {
+fn thickness(text: &str) -> std::result::Result<f64, String> {
     match text.parse::<f64>() {
-        Ok(value) if (0.0..=10_000.0).contains(&value) => Ok(value),
-        _ => Err("give a number of mm, 0 to 10000".to_owned()),
+        Ok(value) if (0.0..=200.0).contains(&value) => Ok(value),
+        _ => Err("give a number of mm, 0 to 200".to_owned()),
     }
 }
 

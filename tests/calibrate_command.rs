@@ -154,7 +154,7 @@ fn from_pictures_to_a_camera_over_its_belt() {
 
     let wrong = ["views", "--board", "9x6", "--square-mm", "30", "--out", "wrong.toml"];
     let output = calibrate("lens", &wrong, &folder);
-    refused(&output, 2, &["0 usable views", "the board found in 0"]);
+    refused(&output, 2, &["0 usable views", "the board found in 0", "8x5 inner corners"]);
     assert!(text(&output.stdout).contains("8x5 inner corners, not 9x6"));
     assert!(!folder.join("wrong.toml").exists());
 }
@@ -173,7 +173,7 @@ fn a_wrong_command_line_names_what_it_wants() {
     refused(&lens("9x2", "25"), 2, &["3 to 60"]);
     refused(&lens("9x6", "-1"), 2, &["--square-mm"]);
     refused(&lens("9x6", "0"), 2, &["above 0"]);
-    refused(&lens("9x6", "nan"), 2, &["0 to 10000"]);
+    refused(&lens("9x6", "nan"), 2, &["at most 10000"]);
     refused(&lens("9x6", "25"), 1, &["a.png"]);
     let half = ["a.png", "--board", "9x6", "--square-mm", "25", "--out", "x", "--focal-mm", "8"];
     refused(&calibrate("lens", &half, &folder), 2, &["--sensor-width-mm"]);
@@ -213,6 +213,11 @@ fn surveyed_points_from_a_table() {
     let before = fs::read(folder.join("camera.toml")).expect("written");
     let html = ["--points", "points.csv", "--lens", "lens.toml", "--out", "camera.html"];
     refused(&calibrate("belt", &html, &folder), 2, &["camera.html", ".toml"]);
+    let itself = ["--points", "points.csv", "--lens", "lens.toml", "--out", "points.csv"];
+    refused(&calibrate("belt", &itself, &folder), 2, &["points.csv", "one of the inputs"]);
+    fs::create_dir(folder.join("folder")).expect("writable");
+    let special = ["--points", "points.csv", "--lens", "lens.toml", "--out", "folder"];
+    refused(&calibrate("belt", &special, &folder), 2, &["not a plain file"]);
     refused(&run("1,2,3\n"), 2, &["points.csv, line 1", "five numbers"]);
     refused(&run("X,Y,Z,u,v\n1,2,0,3,x\n"), 2, &["line 2"]);
     refused(&run("1,2,0,3,inf\n"), 2, &["line 1"]);

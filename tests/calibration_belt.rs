@@ -189,6 +189,18 @@ fn a_wrong_lens_is_warned_about() {
 }
 
 #[test]
+fn a_board_that_slipped_is_warned_about_and_costs_certainty() {
+    let mut random = Random(37);
+    let mut images = pass(&mut random);
+    images[1] = on_belt([-150.0, 155.0], 20.0, 0.0, &mut random);
+    let found = belt(&images, 3, 0.0).expect("a pass, nearly");
+    assert!(found.warnings.iter().any(|w| w.contains("slipped")), "{:?}", found.warnings);
+    let [_, _, travel] = belt_errors(&found.camera);
+    let sigma = found.sigma_travel_deg.expect("from a pass");
+    assert!(sigma > 0.05 && travel.abs() < 5.0 * sigma, "{travel} {sigma}");
+}
+
+#[test]
 fn no_still_is_refused() {
     assert_refused(belt(&[], 0, 0.0), &["no still"]);
 }

@@ -160,40 +160,80 @@ fn score(truth: &Json, records: &[Json]) -> Score {
     result
 }
 
-/// Measure a rendered sequence with the nominal speed 2 % wrong.
-fn rendered(name: &str) -> Option<Score> {
-    let data = shared_data(&format!("data/rendered/{name}"))?;
+/// Measure a rendered sequence with the nominal speed 2 % wrong. `calibrate` may replace the
+/// true camera file in the folder given.
+fn rendered(name: &str, calibrate: impl Fn(&Path, &Path)) -> Option<Score> {
+    let rendered = shared_data("data/rendered")?;
+    let data = rendered.join(name);
     let truth = load(&data.join("truth.json"));
     let folder = scratch(name);
     let config = write_site(&folder, &truth, 1.02 * number(&truth, "belt_speed_mm_s"));
+    calibrate(&rendered, &folder);
     let found = measure_video(&data.join(format!("{name}.mkv")), &config, &folder);
     Some(score(&truth, &found))
 }
 
-// What is promised at this stage is 5 mm; what is reached, with a path tracer's rounded edges
-// (0.3 mm a side) and compressed video, is 1.1 to 1.8 mm. The gate keeps what is reached.
-const MEAN_MM: f64 = 2.2;
-/// No record without a flag may be worse than this.
-const WORST_MM: f64 = 4.0;
+/// `calibrate lens` and `calibrate belt` on the stills that belong to a sequence.
+fn calibrate_from_stills(rendered: &Path, folder: &Path, belt: &str) {
+    let calibrate = |what: &str, stills: &Path, count: usize, more: &[&str], out: &str| {
+        let mut files: Vec<PathBuf> = std::fs::read_dir(stills)
+            .expect("readable")
+            .map(|e| e.expect("readable").path())
+            .filter(|p| p.extension().is_some_and(|e| e == "png"))
+            .collect();
+        files.sort();
+        let status = beltgauge()
+            .args(["calibrate", what])
+            .args(&files[..count])
+            .args(["--board", "9x6", "--square-mm", "25", "--out"])
+            .arg(folder.join(out))
+            .args(more)
+            .status();
+        assert!(status.expect("starts").success());
+    };
+    calibrate("lens", &rendered.join("calib_lens"), 16, &[], "lens.toml");
+    let lens = folder.join("lens.toml");
+    let lens = lens.to_str().expect("a path");
+    let more = ["--lens", lens, "--board-thickness-mm", "0.5"];
+    calibrate("belt", &rendered.join(belt), 3, &more, "camera.toml");
+}
 
-/// Every expected parcel once, nothing else, and the mean error within the gate.
-fn assert_all_found_once(name: &str) {
-    let Some(score) = rendered(name) else { return };
-    assert!(score.missed.is_empty(), "{:?}", score.missed);
-    assert!(score.unmatched.is_empty(), "{:?}", score.unmatched);
-    assert!(score.mean_mm() < MEAN_MM, "mean error {:.2} mm", score.mean_mm());
-    let worst_mm = score.whole_pass_errors_mm.iter().copied().fold(0.0, f64::max);
-    assert!(worst_mm < WORST_MM, "largest error of a whole pass {worst_mm:.2} mm");
+// With a path tracer's rounded edges (0.3 mm a side) and compressed video 0.9 to 1.3 mm is
+// reached, the latter when the dark parcel that the end cuts off is taken with its shadow. The
+// gate keeps what is reached.
+const MEAN_MM: f64 = 1.6;
+/// No record without a flag may be worse than this; 2.0 is reached.
+const WORST_MM: f64 = 2.5;
+/// Own calibration may cost this, on the mean.
+const CALIBRATION_MM: f64 = 0.2;
+
+/// Every expected parcel once, nothing else, and the mean error within the gate; the same with
+/// the camera that our own calibration makes of stills.
+fn assert_all_found_once(name: &str, belt: &str) {
+    let Some(with_truth) = rendered(name, |_, _| ()) else { return };
+    let Some(own) = rendered(name, |data, folder| calibrate_from_stills(data, folder, belt)) else {
+        return;
+    };
+    for score in [&with_truth, &own] {
+        assert!(score.missed.is_empty(), "{:?}", score.missed);
+        assert!(score.unmatched.is_empty(), "{:?}", score.unmatched);
+        assert!(score.mean_mm() < MEAN_MM, "mean error {:.2} mm", score.mean_mm());
+        let worst_mm = score.whole_pass_errors_mm.iter().copied().fold(0.0, f64::max);
+        assert!(worst_mm < WORST_MM, "largest error of a whole pass {worst_mm:.2} mm");
+    }
+    let [truth_mm, own_mm] = [&with_truth, &own].map(Score::mean_mm);
+    eprintln!("{name}: mean {truth_mm:.3} mm with the true camera, {own_mm:.3} mm with our own");
+    assert!(own_mm < truth_mm + CALIBRATION_MM, "{own_mm} {truth_mm}");
 }
 
 #[test]
 fn public_a_straight_down() {
-    assert_all_found_once("public_a");
+    assert_all_found_once("public_a", "calib_belt_a");
 }
 
 #[test]
 fn public_b_tilted_camera_and_drifting_light() {
-    assert_all_found_once("public_b");
+    assert_all_found_once("public_b", "calib_belt_b");
 }
 
 #[test]

@@ -99,8 +99,9 @@ impl CalibrationFile {
              # Pixel centres as in OpenCV; X_camera = R X_belt + t; lengths in mm.\n{body}"
         );
         let beside = path.with_extension("toml.new");
-        std::fs::write(&beside, text)
-            .and_then(|()| std::fs::rename(&beside, path))
-            .map_err(|e| failed(&e))
+        std::fs::write(&beside, text).and_then(|()| std::fs::rename(&beside, path)).map_err(|e| {
+            let _ = std::fs::remove_file(&beside);
+            failed(&e)
+        })
     }
 }

@@ -42,8 +42,9 @@ pub fn lens(
     out: &Path,
     say: &mut dyn FnMut(&str) -> Result<()>,
 ) -> Result<Vec<String>> {
-    let page = report_beside(out)?;
-    let shots = look(&files_of(images)?, None, board, say)?;
+    let files = files_of(images)?;
+    let page = report_beside(out, &[&files])?;
+    let shots = look(&files, None, board, say)?;
     let size_px = shots[0].still.size_px;
     let found: Vec<BoardImage> = shots.iter().filter_map(|s| s.board.clone().ok()).collect();
     let start = data_sheet.map_or(LensStart::Unknown, |sheet| {
@@ -51,7 +52,7 @@ pub fn lens(
     });
     let shape = BoardShape::Estimated;
     let calibration = calibrate_lens(board, size_px, &found, model, start, shape)
-        .map_err(|e| e.at(seen_summary(&shots)))?;
+        .map_err(|e| e.at(seen_summary(board, &shots)))?;
     let entries = lens_entries(board, &shots, &calibration);
     let sigma = LensSigmaTable::new(model, calibration.sigma);
     CalibrationFile::lens(
@@ -82,10 +83,10 @@ pub fn belt(
     out: &Path,
     say: &mut dyn FnMut(&str) -> Result<()>,
 ) -> Result<Vec<String>> {
-    let page = report_beside(out)?;
     let lens = CameraFile::load_lens(lens_file)?;
     let carried = files_of(carried)?;
     let elsewhere = files_of(elsewhere)?;
+    let page = report_beside(out, &[&carried, &elsewhere])?;
     let files = [&carried[..], &elsewhere].concat();
     let shots = look(&files, Some(lens.image_size_px), board, say)?;
     let mut stills = Vec::with_capacity(shots.len());
@@ -133,7 +134,7 @@ pub fn points(
     out: &Path,
     say: &mut dyn FnMut(&str) -> Result<()>,
 ) -> Result<Vec<String>> {
-    let page = report_beside(out)?;
+    let page = report_beside(out, &[&[csv.to_owned()]])?;
     let lens = CameraFile::load_lens(lens_file)?;
     let points = read_points(csv)?;
     let calibration = calibrate_points(&lens, &points).map_err(|e| e.in_file(csv))?;
@@ -215,9 +216,15 @@ fn not_found(board: &Chessboard, reason: NotFound) -> String {
 }
 
 /// What the images hold, for an error about all of them.
-fn seen_summary(shots: &[Shot]) -> String {
+fn seen_summary(board: &Chessboard, shots: &[Shot]) -> String {
     let found = shots.iter().filter(|s| s.board.is_ok()).count();
-    format!("{} images, the board found in {found}", shots.len())
+    let mut summary = format!("{} images, the board found in {found}", shots.len());
+    let other =
+        shots.iter().find_map(|s| s.board.as_ref().err().filter(|e| **e != NotFound::NoGrid));
+    if let (0, Some(reason)) = (found, other) {
+        summary += &format!(" (--board: {})", not_found(board, *reason));
+    }
+    summary
 }
 
 fn lens_entries(
@@ -287,9 +294,24 @@ fn check_size(path: &Path, size_px: [usize; 2], expected: Option<[usize; 2]>) ->
     }
 }
 
-/// The report goes beside the camera file, as .html.
-fn report_beside(out: &Path) -> Result<PathBuf> {
+/// Where the report goes: beside the camera file, as .html. Refuses, before any work, an output
+/// that would destroy something else than an earlier result.
+fn report_beside(out: &Path, inputs: &[&[PathBuf]]) -> Result<PathBuf> {
     let page = out.with_extension("html");
+    let refused = |what: &str| {
+        Err(Error::configuration(what.to_owned())
+            .in_file(out)
+            .remedy("name a new file, or the result of an earlier calibration, with --out"))
+    };
+    for file in [out, &page] {
+        if std::fs::symlink_metadata(file).is_ok_and(|m| !m.is_file()) {
+            return refused("--out, or its report beside it, is not a plain file");
+        }
+        let same = |input: &PathBuf| matches!((input.canonicalize(), file.canonicalize()), (Ok(a), Ok(b)) if a == b);
+        if inputs.iter().copied().flatten().any(same) {
+            return refused("--out, or its report beside it, is one of the inputs");
+        }
+    }
     if page == out {
         return Err(Error::configuration("--out would be overwritten by its own report")
             .in_file(out)

@@ -43,6 +43,10 @@ impl Still {
 type Reader = image::ImageReader<std::io::BufReader<std::fs::File>>;
 
 fn reader(path: &Path) -> Result<Reader> {
+    // Opening a pipe would wait for ever.
+    if std::fs::metadata(path).is_ok_and(|m| !m.is_file()) {
+        return Err(Error::failure("not an image file").in_file(path));
+    }
     image::ImageReader::open(path)
         .and_then(image::ImageReader::with_guessed_format)
         .map_err(|e| Error::failure(format!("cannot open: {e}")).in_file(path))

@@ -57,8 +57,11 @@ const SIGMAS: f64 = 5.0;
 /// A still's error, lying in the common plane, against that on its own.
 const FLAT_RATIO: f64 = 2.0;
 const FLAT_PX: f64 = 0.3;
-/// Sharp stills through the right lens reach a fifth of this.
-const RMS_PX_WANTED: f64 = 0.5;
+/// Errors of all stills together against those of each alone: above this they share an error.
+const SHARED_RATIO: f64 = 1.3;
+/// Relative standard deviation of the height, and that of the tilt, that parcels can bear.
+const HEIGHT_SIGMA_WANTED: f64 = 0.003;
+const TILT_SIGMA_WANTED_DEG: f64 = 0.1;
 /// A travel direction from a shorter way, in squares, is worth little.
 const TRAVEL_SQUARES_WANTED: f64 = 4.0;
 const STEPS_MAX: usize = 50;
@@ -84,9 +87,18 @@ pub fn calibrate_belt(
         return Err(Error::configuration("no still of the board").remedy("give at least one"));
     }
     let stills = Stills::new(board, &lens.lens, &[carried, elsewhere].concat());
-    let (first, plane) = stills.lie_flat()?;
+    let (own_px, first, plane) = stills.lie_flat()?;
     let fit = if pass > 1 { stills.carried(first, &plane, pass)? } else { plane };
-    let sigma_px = fit.sigma_px();
+    // What the stills do not say on their own is an error that a still's corners share: a slip of
+    // the board, the lens. It does not average out over them.
+    let shared_px2 = fit.sigma_px().powi(2) - own_px * own_px;
+    let corners_per_still = fit.corners() / fit.stills.len() as f64;
+    let shares_an_error = fit.sigma_px() > SHARED_RATIO * own_px;
+    let sigma_px = if shares_an_error {
+        (fit.sigma_px().powi(2) + (corners_per_still - 1.0) * shared_px2).sqrt()
+    } else {
+        fit.sigma_px()
+    };
     let covariance = fit
         .normal
         .covariance()
@@ -115,26 +127,36 @@ pub fn calibrate_belt(
     };
     let height_mm = camera.checked_height_mm()?;
     let ways_mm = fit.layout.ways(&fit.parameters);
+    let sigma_height_mm = sigma(&|c| c.centre_in_belt().z).hypot(lens.focal_sigma() * height_mm);
+    let sigma_tilt_deg = sigma(&|c| turn_deg(c, 0, 2)).max(sigma(&|c| turn_deg(c, 1, 2)));
+    let mut warnings = warnings(board, &ways_mm);
+    if shares_an_error {
+        warnings.push(format!(
+            "together the stills fit only to {:.2} px, each on its own to {own_px:.2} px: the board \
+             slipped or does not lie flat, or --lens is not this camera's with this focus",
+            fit.sigma_px()
+        ));
+    }
+    if sigma_height_mm > HEIGHT_SIGMA_WANTED * height_mm || sigma_tilt_deg > TILT_SIGMA_WANTED_DEG {
+        warnings.push(format!(
+            "the belt is known only to {sigma_height_mm:.1} mm and {sigma_tilt_deg:.2} degrees: use a \
+             larger board, more stills (also --elsewhere), and a better lens calibration"
+        ));
+    }
     Ok(BeltCalibration {
         rms_px: fit.rms_px(),
-        sigma_height_mm: sigma(&|c| c.centre_in_belt().z).hypot(lens.focal_sigma() * height_mm),
-        sigma_tilt_deg: sigma(&|c| turn_deg(c, 0, 2)).max(sigma(&|c| turn_deg(c, 1, 2))),
+        sigma_height_mm,
+        sigma_tilt_deg,
         sigma_travel_deg: (pass > 1).then(|| sigma(&|c| turn_deg(c, 1, 0))),
-        warnings: warnings(board, &ways_mm, fit.rms_px()),
+        warnings,
         travel_mm: ways_mm,
         stills: fit.stills,
         camera,
     })
 }
 
-fn warnings(board: &Chessboard, ways_mm: &[f64], rms_px: f64) -> Vec<String> {
+fn warnings(board: &Chessboard, ways_mm: &[f64]) -> Vec<String> {
     let mut warnings = Vec::new();
-    if rms_px > RMS_PX_WANTED {
-        warnings.push(format!(
-            "the corners are off by {rms_px:.2} px (rms), a lens that fits reaches 0.1: check that \
-             --lens is this camera's, with this focus, and that the board is flat"
-        ));
-    }
     let way_mm = ways_mm.last().copied().unwrap_or(0.0);
     if ways_mm.len() == 1 {
         warnings.push(
@@ -228,8 +250,11 @@ impl Fit {
 
     /// Of one coordinate.
     fn sigma_px(&self) -> f64 {
-        let freedom = 2.0 * self.corners() - self.parameters.len() as f64;
-        (self.normal.cost / freedom.max(1.0)).sqrt()
+        (self.normal.cost / self.freedom()).sqrt()
+    }
+
+    fn freedom(&self) -> f64 {
+        (2.0 * self.corners() - self.parameters.len() as f64).max(1.0)
     }
 }
 
@@ -307,9 +332,9 @@ impl<'a> Stills<'a> {
             })
     }
 
-    /// The first board's own pose, and all boards in one plane, each anywhere and turned anyhow
-    /// in it.
-    fn lie_flat(&self) -> Result<(Pose, Fit)> {
+    /// Errors of the stills each on its own (standard deviation of a coordinate, px), the first board's own pose, and all boards
+    /// in one plane, each anywhere and turned anyhow in it.
+    fn lie_flat(&self) -> Result<(f64, Pose, Fit)> {
         let own: Vec<Fit> =
             (0..self.names.len()).map(|k| self.own_fit(k)).collect::<Result<_>>()?;
         let first = own[0].first;
@@ -340,7 +365,10 @@ impl<'a> Stills<'a> {
                 ));
             }
         }
-        Ok((first, fit))
+        // Of one coordinate, as Fit::sigma_px.
+        let squares: f64 = own.iter().map(|f| f.normal.cost).sum();
+        let freedom: f64 = own.iter().map(Fit::freedom).sum();
+        Ok(((squares / freedom).sqrt(), first, fit))
     }
 
     /// The first `pass` boards on one straight way, turned alike.

@@ -48,6 +48,8 @@ const WITHOUT_RATIO: f64 = 0.3;
 const DISAGREEMENT_PX: f64 = 1.0;
 /// Points that disagree by more, as part of the image's width, are not a survey.
 const DISAGREEMENT_MAX: f64 = 0.01;
+/// A height less certain than this part of it is none.
+const HEIGHT_SIGMA_MAX: f64 = 0.02;
 /// A point is picked in an image no better than this.
 const POINTING_PX: f64 = 0.3;
 const STEPS_MAX: usize = 50;
@@ -96,6 +98,14 @@ pub fn calibrate_points(
     let lever = up.cross(&pose.translation_mm);
     let slopes = DVector::from_iterator(6, lever.iter().chain(up.iter()).copied());
     let of_points = (slopes.transpose() * &covariance * &slopes)[0].max(0.0).sqrt();
+    let sigma_height_mm = of_points.hypot(calibrated.focal_sigma() * height_mm);
+    if sigma_height_mm > HEIGHT_SIGMA_MAX * height_mm {
+        return Err(Error::configuration(format!(
+            "the points determine the height only to {sigma_height_mm:.0} mm"
+        ))
+        .allowed(format!("{:.0} mm", HEIGHT_SIGMA_MAX * height_mm))
+        .remedy("survey more points, spread over the whole zone, along and across the belt"));
+    }
     let mut warnings = Vec::new();
     if points.len() <= COPLANAR_MIN {
         warnings.push("so few points cannot check each other: survey more".to_owned());
@@ -109,7 +119,7 @@ pub fn calibrate_points(
         origin_mm: [centre.x, centre.y],
         rms_px,
         error_px,
-        sigma_height_mm: of_points.hypot(calibrated.focal_sigma() * height_mm),
+        sigma_height_mm,
         sigma_tilt_deg: turn_deg(&axes[0]).max(turn_deg(&axes[1])),
         sigma_travel_deg: turn_deg(&axes[2]),
         warnings,
