@@ -218,13 +218,13 @@ fn not_found(board: &Chessboard, reason: NotFound) -> String {
 /// What the images hold, for an error about all of them.
 fn seen_summary(board: &Chessboard, shots: &[Shot]) -> String {
     let found = shots.iter().filter(|s| s.board.is_ok()).count();
-    let mut summary = format!("{} images, the board found in {found}", shots.len());
+    let summary = format!("{} images, the board found in {found}", shots.len());
     let other =
         shots.iter().find_map(|s| s.board.as_ref().err().filter(|e| **e != NotFound::NoGrid));
-    if let (0, Some(reason)) = (found, other) {
-        summary += &format!(" (--board: {})", not_found(board, *reason));
+    match other {
+        Some(reason) if found == 0 => format!("{summary} (--board: {})", not_found(board, *reason)),
+        _ => summary,
     }
-    summary
 }
 
 fn lens_entries(
