@@ -201,6 +201,14 @@ fn a_board_that_slipped_is_warned_about_and_costs_certainty() {
 }
 
 #[test]
+fn the_same_still_twice_is_refused() {
+    let mut random = Random(38);
+    let mut images = pass(&mut random);
+    images.push(images[0].clone());
+    assert_refused(belt(&images, 3, 0.0), &["the same still as belt_00.png", "belt_03.png"]);
+}
+
+#[test]
 fn no_still_is_refused() {
     assert_refused(belt(&[], 0, 0.0), &["no still"]);
 }

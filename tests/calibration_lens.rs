@@ -247,6 +247,18 @@ fn the_same_view_many_times_is_refused() {
 }
 
 #[test]
+fn a_copy_of_a_view_adds_nothing() {
+    let mut random = Random(17);
+    let images = views(&brown(), &poses(12, &mut random), &mut random);
+    let once = calibrate(&images, LensModel::Brown).expect("good views");
+    let twice = calibrate(&[&images[..], &images[..3]].concat(), LensModel::Brown);
+    let twice = twice.expect("good views");
+    assert_eq!(once.sigma[0].to_bits(), twice.sigma[0].to_bits());
+    let reason = twice.views[13].rejected.as_ref().expect("rejected");
+    assert_eq!(reason, "a copy of view 2");
+}
+
+#[test]
 fn stretched_images_are_refused() {
     let mut random = Random(12);
     let stretched = focal(1019.3, 1.45 * 1019.3);

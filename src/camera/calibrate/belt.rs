@@ -86,7 +86,15 @@ pub fn calibrate_belt(
     if pass == 0 {
         return Err(Error::configuration("no still of the board").remedy("give at least one"));
     }
-    let stills = Stills::new(board, &lens.lens, &[carried, elsewhere].concat());
+    let all = [carried, elsewhere].concat();
+    for (k, still) in all.iter().enumerate() {
+        if let Some(first) = all[..k].iter().find(|s| s.board.corners == still.board.corners) {
+            return Err(Error::configuration(format!("the same still as {}", first.name))
+                .at(still.name)
+                .remedy("give every still once"));
+        }
+    }
+    let stills = Stills::new(board, &lens.lens, &all);
     let (own_px, first, plane) = stills.lie_flat()?;
     let fit = if pass > 1 { stills.carried(first, &plane, pass)? } else { plane };
     // What the stills do not say on their own is an error that a still's corners share: a slip of

@@ -93,7 +93,7 @@ pub fn calibrate_lens(
     start: LensStart,
     shape: BoardShape,
 ) -> Result<LensCalibration> {
-    let mut rejected = verdict::blurred(images, SMEAR_PX_MAX, VIEWS_MIN);
+    let mut rejected = verdict::unusable(images, SMEAR_PX_MAX, VIEWS_MIN);
     let mut found: Option<(Lens, Vec<Pose>)> = None;
     loop {
         let kept: Vec<usize> = (0..images.len()).filter(|&v| rejected[v].is_none()).collect();

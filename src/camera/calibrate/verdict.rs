@@ -41,8 +41,9 @@ pub(super) fn undetermined() -> Error {
         .remedy(TILT_REMEDY)
 }
 
-/// For each image why its blur makes it useless, as long as `views_min` others remain.
-pub(super) fn blurred(
+/// For each image why it is of no use: a copy of an earlier one, or blurred, as long as
+/// `views_min` others remain.
+pub(super) fn unusable(
     images: &[BoardImage],
     smear_px_max: f64,
     views_min: usize,
@@ -64,6 +65,12 @@ pub(super) fn blurred(
         .collect();
     if reasons.iter().filter(|r| r.is_none()).count() < views_min {
         reasons.fill(None);
+    }
+    for (v, reason) in reasons.iter_mut().enumerate() {
+        // Noise makes two photographs differ; a copy would only pretend to know more.
+        if let Some(first) = (0..v).find(|&first| images[first].corners == images[v].corners) {
+            *reason = Some(format!("a copy of view {}", first + 1));
+        }
     }
     reasons
 }
@@ -108,7 +115,7 @@ fn check_views(
     calibration: &LensCalibration,
     warnings: &mut Vec<String>,
 ) -> Result<()> {
-    if 2 * kept.len() <= images.len() {
+    if 2 * kept.len() < images.len() {
         let reasons: Vec<String> = calibration
             .views
             .iter()
