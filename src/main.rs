@@ -42,7 +42,7 @@ enum Command {
     },
     /// Measure a recording, as fast as it goes.
     Measure {
-        /// Y4M file, `-` for Y4M on standard input, or a directory of PNG, PGM or JPEG frames.
+        /// Y4M file, `-` for Y4M on standard input, or a directory of image files.
         input: PathBuf,
         /// Configuration file.
         #[arg(long)]

@@ -13,27 +13,11 @@ use beltgauge::error::Result;
 use beltgauge::source::synthetic::Random;
 use beltgauge::units::RawPx;
 use nalgebra::{Matrix3, Rotation3, Vector3};
-use scene::seen;
+use scene::{assert_refused, brown, seen};
 
 const SIZE: [usize; 2] = [1920, 1200];
 /// What the finder reaches in a good image.
 const NOISE_PX: f64 = 0.05;
-
-fn brown() -> Lens {
-    Lens::new(
-        LensModel::Brown,
-        [1019.3, 1019.9],
-        [940.2, 599.1],
-        [-0.181, 0.080, 0.0005, -0.0004, -0.008],
-    )
-}
-
-fn assert_refused<T: std::fmt::Debug>(result: Result<T>, words: &[&str]) {
-    let error = result.expect_err("must be refused").to_string();
-    for word in words {
-        assert!(error.contains(word), "no {word:?} in: {error}");
-    }
-}
 
 /// A camera 1508 mm above the belt, tilted; X along travel.
 fn camera() -> Camera {

@@ -9,7 +9,7 @@ use beltgauge::camera::{Lens, LensModel};
 use beltgauge::error::Result;
 use beltgauge::source::synthetic::Random;
 use nalgebra::{Rotation3, Vector3};
-use scene::{pose, seen};
+use scene::{assert_refused, brown, pose, seen};
 
 const SIZE: [usize; 2] = [1920, 1200];
 /// What the finder reaches in a good image.
@@ -17,15 +17,6 @@ const NOISE_PX: f64 = 0.05;
 
 fn board() -> Chessboard {
     Chessboard::new([9, 6], 25.0)
-}
-
-fn brown() -> Lens {
-    Lens::new(
-        LensModel::Brown,
-        [1019.3, 1019.9],
-        [940.2, 599.1],
-        [-0.181, 0.080, 0.0005, -0.0004, -0.008],
-    )
 }
 
 /// The brown lens with other focal lengths.
@@ -197,13 +188,6 @@ fn a_view_smeared_by_motion_is_rejected() {
     let found = calibrate(&images, LensModel::Brown).expect("good views");
     assert!(found.views[2].rejected.as_ref().is_some_and(|r| r.contains("motion")));
     assert_recovers(&brown(), &found);
-}
-
-fn assert_refused<T: std::fmt::Debug>(result: Result<T>, words: &[&str]) {
-    let error = result.expect_err("must be refused").to_string();
-    for word in words {
-        assert!(error.contains(word), "no {word:?} in: {error}");
-    }
 }
 
 #[test]

@@ -300,3 +300,48 @@ fn remove_shading(row: &mut [i8]) {
         }
     }
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// A parabola through the middle three shifts is off by up to 0.028 px here.
+    #[test]
+    fn the_peak_of_a_smooth_correlation_is_found_between_shifts() {
+        for tenth in -4..=4 {
+            let truth = f64::from(tenth) / 10.0;
+            let around = std::array::from_fn(|k| {
+                let x = (k as isize - PEAK_HALF) as f64 - truth;
+                (-0.5 * (x / 1.3).powi(2)).exp()
+            });
+            let found = peak(&around).expect("a peak");
+            // Four samples to each side leave 0.0015 px of this Gaussian.
+            assert!((found - truth).abs() < 0.003, "{truth}: {found}");
+        }
+    }
+
+    #[test]
+    fn a_slope_has_no_peak() {
+        assert_eq!(peak(&std::array::from_fn(|k| k as f64)), None);
+    }
+
+    #[test]
+    fn shading_goes_and_texture_stays() {
+        let texture = |u: usize| if u % 4 < 2 { 20 } else { -20 };
+        let hidden = |u: usize| (90..110).contains(&u);
+        let mut row: [i8; 200] = std::array::from_fn(|u| {
+            let shading = (u as i32 - 100) / 2;
+            if hidden(u) { NO_TEXTURE } else { (texture(u) + shading) as i8 }
+        });
+        remove_shading(&mut row);
+        for (u, &value) in row.iter().enumerate() {
+            let error = i32::from(value) - texture(u);
+            // At an end the mean is of one side: half the window's ramp, and the texture's own.
+            let slack = SHADING_PX as i32 / 4 + 4;
+            assert!(
+                if hidden(u) { value == NO_TEXTURE } else { error.abs() <= slack },
+                "{u} {value}"
+            );
+        }
+    }
+}

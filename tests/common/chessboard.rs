@@ -2,13 +2,32 @@
 //! and uneven light.
 #![allow(dead_code)] // each test uses its part
 
-use beltgauge::camera::Lens;
 use beltgauge::camera::calibrate::Pose;
 use beltgauge::camera::chessboard::{BoardImage, Chessboard, Corner};
+use beltgauge::camera::{Lens, LensModel};
+use beltgauge::error::Result;
 use beltgauge::source::Still;
 use beltgauge::source::synthetic::Random;
 use beltgauge::units::RawPx;
 use nalgebra::{Rotation3, Vector3};
+
+/// The lens of the reference camera: strong barrel distortion.
+pub fn brown() -> Lens {
+    Lens::new(
+        LensModel::Brown,
+        [1019.3, 1019.9],
+        [940.2, 599.1],
+        [-0.181, 0.080, 0.0005, -0.0004, -0.008],
+    )
+}
+
+/// A refusal whose text has every one of `words`.
+pub fn assert_refused<T: std::fmt::Debug>(result: Result<T>, words: &[&str]) {
+    let error = result.expect_err("must be refused").to_string();
+    for word in words {
+        assert!(error.contains(word), "no {word:?} in: {error}");
+    }
+}
 
 /// How a picture is taken.
 #[derive(Clone, Copy)]

@@ -340,8 +340,8 @@ impl<'a> Stills<'a> {
             })
     }
 
-    /// Errors of the stills each on its own (standard deviation of a coordinate, px), the first board's own pose, and all boards
-    /// in one plane, each anywhere and turned anyhow in it.
+    /// Errors of the stills each on its own (standard deviation of a coordinate, px), the first
+    /// board's own pose, and all boards in one plane, each anywhere and turned anyhow in it.
     fn lie_flat(&self) -> Result<(f64, Pose, Fit)> {
         let own: Vec<Fit> =
             (0..self.names.len()).map(|k| self.own_fit(k)).collect::<Result<_>>()?;
