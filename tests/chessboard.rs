@@ -206,6 +206,18 @@ fn a_symmetric_board_with_hidden_corners_is_named_alike() {
 }
 
 #[test]
+fn the_direction_does_not_depend_on_where_the_board_is_or_what_is_hidden() {
+    let (board, lens) = (Chessboard::new([8, 6], 25.0), pinhole(VGA));
+    let pose = pose(&board, [0.0, 0.0, 30.0], [-120.0, 80.0, 700.0]);
+    let mut seen = corners(&board, &lens, &pose).expect("in front");
+    seen.retain(|c| c.column > 0 || c.row > 2); // half of one end is hidden
+    let direction = board.direction(&seen);
+    let angle_deg = direction.y.atan2(direction.x).to_degrees();
+    // The hidden corners tilt it by a few degrees.
+    assert!((angle_deg - 30.0).abs() < 8.0, "{angle_deg}");
+}
+
+#[test]
 fn the_wanted_board_is_found_beside_a_larger_one() {
     let lens = pinhole([1280, 720]);
     let (small, large) = (Chessboard::new([8, 5], 25.0), Chessboard::new([11, 8], 25.0));
