@@ -106,6 +106,7 @@ impl Pipeline {
             view.clone(),
             zone,
             site.height_max_mm,
+            measure::Rounding::of_radius(config.measure.edge_radius_mm),
             config.limits.views_per_track_max,
             memory,
         )?;

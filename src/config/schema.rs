@@ -28,6 +28,9 @@ pub struct Config {
     /// `[odometry]`
     #[serde(default)]
     pub odometry: Odometry,
+    /// `[measure]`
+    #[serde(default)]
+    pub measure: Measure,
     /// `[limits]`
     #[serde(default)]
     pub limits: Limits,
@@ -123,6 +126,20 @@ impl Default for Odometry {
     }
 }
 
+/// `[measure]`: from edges to a cuboid.
+#[derive(Clone, Debug, PartialEq, Deserialize)]
+#[serde(deny_unknown_fields, default)]
+pub struct Measure {
+    /// Radius of a parcel's edges: rounded edges appear inside of the outer size.
+    pub edge_radius_mm: f64,
+}
+
+impl Default for Measure {
+    fn default() -> Self {
+        Self { edge_radius_mm: 1.2 }
+    }
+}
+
 /// `[limits]`: the size of every table.
 #[derive(Clone, Debug, PartialEq, Deserialize)]
 #[serde(deny_unknown_fields, default)]
@@ -189,8 +206,18 @@ impl Config {
     }
 
     fn check(&self) -> Result<()> {
-        let Self { camera: _, zone, belt, view, background, segment, odometry, limits, modbus } =
-            self;
+        let Self {
+            camera: _,
+            zone,
+            belt,
+            view,
+            background,
+            segment,
+            odometry,
+            measure,
+            limits,
+            modbus,
+        } = self;
         for (key, mm) in [
             ("zone.x_min_mm", zone.x_min_mm),
             ("zone.x_max_mm", zone.x_max_mm),
@@ -230,6 +257,7 @@ impl Config {
         count("segment.close_px", segment.close_px, 0, 30)?;
         range("segment.area_min_mm2", segment.area_min_mm2, 1.0, 1e6, "mm2")?;
         range("odometry.speed_error_max", odometry.speed_error_max, 0.0, 0.2, "")?;
+        range("measure.edge_radius_mm", measure.edge_radius_mm, 0.0, 20.0, "mm")?;
         count("limits.memory_mib_max", limits.memory_mib_max, 1, 16_384)?;
         count("limits.tracks_max", limits.tracks_max, 1, 256)?;
         count("limits.runs_max", limits.runs_max, 256, 1 << 20)?;

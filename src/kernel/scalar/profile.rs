@@ -2,12 +2,15 @@
 
 use crate::image::Plane;
 
+/// A step is no wider than twice this many samples.
+const RAMP: usize = 4;
+
 /// A step found on a profile.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
 pub struct Step {
     /// Position along the profile, in samples from its first.
     pub at: f32,
-    /// Grey levels a sample, positive when the profile rises.
+    /// Grey levels a sample beyond the slope around it, positive when the profile rises.
     pub slope: f32,
 }
 
@@ -41,25 +44,28 @@ pub fn sample(
 /// Returns how many were stored in `steps`.
 ///
 /// The slope is the difference of neighbours smoothed by [1 2 1]; its extremum is refined by
-/// a parabola, which is unbiased for a symmetric blur.
+/// a parabola, which is unbiased for a symmetric blur. A ramp is no step: of a slope counts
+/// what exceeds that on both sides, [`RAMP`] samples away; shadows have wide borders.
 pub fn steps(profile: &[f32], slope_min: f32, steps: &mut [Step]) -> usize {
     let slope = |i: usize| {
         let p = &profile[i - 2..=i + 2];
         (p[4] - p[0] + 2.0 * (p[3] - p[1])) / 8.0
     };
+    let last = profile.len().saturating_sub(3);
     let mut count = 0;
-    for i in 3..profile.len().saturating_sub(3) {
+    for i in 3..last {
         let (before, here, after) = (slope(i - 1), slope(i), slope(i + 1));
         let sign = here.signum();
-        let peak =
-            here * sign >= slope_min && here * sign > before * sign && here * sign >= after * sign;
-        if !peak {
+        let peak = here * sign > before * sign && here * sign >= after * sign;
+        let around = [i.max(2 + RAMP) - RAMP, (i + RAMP).min(last - 1)].map(|j| slope(j) * sign);
+        let sharp = here * sign - around[0].min(around[1]).max(0.0);
+        if !peak || sharp < slope_min {
             continue;
         }
         let curvature = before - 2.0 * here + after;
         let offset = if curvature == 0.0 { 0.0 } else { 0.5 * (before - after) / curvature };
-        let step = Step { at: i as f32 + offset.clamp(-0.5, 0.5), slope: here };
-        let rank = steps[..count].iter().position(|s| s.slope.abs() < here.abs()).unwrap_or(count);
+        let step = Step { at: i as f32 + offset.clamp(-0.5, 0.5), slope: sharp * sign };
+        let rank = steps[..count].iter().position(|s| s.slope.abs() < sharp).unwrap_or(count);
         if rank < steps.len() {
             count = (count + 1).min(steps.len());
             steps[rank..count].rotate_right(1);
@@ -96,6 +102,15 @@ mod tests {
         for level in [0.0, 255.0] {
             assert_eq!(steps(&[level; 25], 1.0, &mut [Step::default(); 3]), 0);
         }
+    }
+
+    #[test]
+    fn a_shadow_s_border_is_no_step() {
+        let ramp: Vec<f32> = (0..40).map(|i| i as f32 * 3.0).collect();
+        assert_eq!(steps(&ramp, 0.8, &mut [Step::default(); 3]), 0);
+        let edge_in_it: Vec<f32> =
+            ramp.iter().zip(blurred_step(15.0, 0.0, 12.0)).map(|(a, b)| a + b).collect();
+        assert_eq!(steps(&edge_in_it, 0.8, &mut [Step::default(); 3]), 1);
     }
 
     #[test]

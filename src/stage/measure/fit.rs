@@ -6,8 +6,8 @@
 //! Source: Nocedal and Wright, chapter 10; Huber 1964 and Tukey's biweight for outliers.
 
 use super::model::{
-    DIRECTIONS, EDGES, EdgeId, HEIGHT, LENGTH, N, Outline, Params, SCALE, WIDTH, X, Y, YAW,
-    canonical, direction,
+    DIRECTIONS, EDGES, EdgeId, HEIGHT, LENGTH, N, Outline, Params, Rounding, SCALE, WIDTH, X, Y,
+    YAW, canonical, direction,
 };
 use super::observe::{EdgeSample, PassView};
 use crate::camera::BeltView;
@@ -59,6 +59,8 @@ pub struct Problem<'a> {
     pub zone: &'a BeltRect,
     /// Upper bound of the height.
     pub height_max_mm: f64,
+    /// What the edges' radius does to them.
+    pub rounding: Rounding,
     /// Travel at which X holds.
     pub reference_travel_mm: f64,
     /// Relative standard uncertainty of the travel.
@@ -131,6 +133,10 @@ impl Normal {
     }
 }
 
+/// Sums of the slopes' signs for each edge: above a hidden side, and above a visible one. A dark
+/// parcel's edge is darker than the belt and brighter than the side under it.
+type Polarity = [[f64; 2]; EDGES];
+
 /// Statistics of the edges used in one iteration.
 #[derive(Clone, Copy, Debug, Default)]
 struct EdgeUse {
@@ -138,11 +144,17 @@ struct EdgeUse {
     used: usize,
     squares: f64,
     contrast: f64,
-    /// Sum of slopes of the chosen steps, for each edge: its polarity.
-    polarity: [f64; EDGES],
+    /// For each edge.
+    polarity: Polarity,
 }
 
 impl Problem<'_> {
+    /// Where a view should show the edges of a cuboid.
+    fn outline(&self, view: &PassView, params: &Params) -> Outline {
+        let travel_mm = view.travel_mm - self.reference_travel_mm;
+        Outline::rounded(self.geometry, self.rounding, params, travel_mm)
+    }
+
     /// Fit silhouettes only, from `start` or from scratch.
     pub fn fit_reach(&self, views: &[PassView], start: Option<Params>) -> Option<Estimate> {
         let candidates = match start {
@@ -188,7 +200,7 @@ impl Problem<'_> {
     /// Gauss-Newton on the edges, the gate closing.
     fn refine_edges(&self, views: &[PassView], start: Params) -> Option<Estimate> {
         let mut params = start;
-        let mut polarity = [0.0; EDGES];
+        let mut polarity = [[0.0; 2]; EDGES];
         let mut last = None;
         for gate_px in GATES_PX {
             let gate_mm = gate_px * self.geometry.mm_per_px;
@@ -213,8 +225,7 @@ impl Problem<'_> {
         let mut depth = [(0.0, 0u32); 4];
         let mut sampled = 0;
         for view in views.iter().filter(|v| !v.samples().is_empty()) {
-            let outline =
-                Outline::new(self.geometry, params, view.travel_mm - self.reference_travel_mm);
+            let outline = self.outline(view, params);
             sampled += 1;
             for (k, (sum, count)) in depth.iter_mut().enumerate() {
                 if outline.side_visible[k] {
@@ -395,8 +406,7 @@ impl Problem<'_> {
     ) -> f64 {
         let (mut squares, mut count) = (0.0, 0);
         for view in views {
-            let outline =
-                Outline::new(self.geometry, params, view.travel_mm - self.reference_travel_mm);
+            let outline = self.outline(view, params);
             let reach = &view.reach_mm[self.silhouette as usize];
             for (k, &reach) in reach.iter().enumerate().filter(|(_, r)| r.is_finite()) {
                 let d = direction(k);
@@ -418,14 +428,13 @@ impl Problem<'_> {
         views: &[PassView],
         params: &Params,
         gate_mm: f64,
-        polarity: &[f64; EDGES],
+        polarity: &Polarity,
         normal: &mut Normal,
     ) -> EdgeUse {
         let mut used = EdgeUse::default();
         let sigma_mm = EDGE_SIGMA_PX * self.geometry.mm_per_px;
         for view in views.iter().filter(|v| !v.samples().is_empty()) {
-            let outline =
-                Outline::new(self.geometry, params, view.travel_mm - self.reference_travel_mm);
+            let outline = self.outline(view, params);
             let trust: [f64; EDGES] = std::array::from_fn(|e| {
                 let edge = EdgeId(e as u8);
                 let depth_px = outline.side_depth_mm(edge.face()) / self.geometry.mm_per_px;
@@ -446,12 +455,12 @@ impl Problem<'_> {
                 }
                 let Some((at, row)) = self.predict(&outline, sample) else { continue };
                 used.offered += 1;
-                let Some((residual, slope)) = choose(sample, at, gate_mm, polarity[e]) else {
-                    continue;
-                };
+                let facing = usize::from(outline.side_visible[sample.edge.face()]);
+                let chosen = choose(sample, at, gate_mm, polarity[e][facing]);
+                let Some((residual, slope)) = chosen else { continue };
                 used.used += 1;
                 used.squares += residual * residual;
-                used.polarity[e] += f64::from(slope.signum());
+                used.polarity[e][facing] += f64::from(slope.signum());
                 let share = residual / gate_mm;
                 let biweight = (1.0 - share * share).powi(2);
                 used.contrast += biweight * f64::from(slope.abs()).ln_1p();

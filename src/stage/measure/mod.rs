@@ -12,7 +12,7 @@ mod model;
 mod observe;
 
 pub use fit::Estimate;
-pub use model::{HEIGHT, LENGTH, Outline, Params, SCALE, WIDTH, X, Y, YAW};
+pub use model::{HEIGHT, LENGTH, Outline, Params, Rounding, SCALE, WIDTH, X, Y, YAW};
 pub use observe::Frame;
 
 use crate::belt::BeltPosition;
@@ -57,6 +57,7 @@ pub struct Measure {
     geometry: BeltView,
     zone: BeltRect,
     height_max_mm: f64,
+    rounding: Rounding,
     views_per_track: usize,
     views: Block<PassView>,
     passes: Block<Pass>,
@@ -78,6 +79,7 @@ impl Measure {
         geometry: BeltView,
         zone: BeltRect,
         height_max_mm: f64,
+        rounding: Rounding,
         views_per_track: usize,
         memory: &mut Memory,
     ) -> Result<Self> {
@@ -95,6 +97,7 @@ impl Measure {
             geometry,
             zone,
             height_max_mm,
+            rounding,
             views_per_track,
             views: memory.take("measure.views", PassView::EMPTY)?,
             passes: memory.take("measure.passes", empty)?,
@@ -194,6 +197,7 @@ impl Measure {
             geometry: &self.geometry,
             zone: &self.zone,
             height_max_mm: self.height_max_mm,
+            rounding: self.rounding,
             reference_travel_mm: pass.first.travel_mm,
             travel_sigma: pass.last.sigma_since(&pass.first),
             silhouette,
@@ -268,6 +272,7 @@ mod tests {
             geometry: &geometry,
             zone: &ZONE,
             height_max_mm: 400.0,
+            rounding: Rounding::default(),
             reference_travel_mm: 0.0,
             travel_sigma,
             silhouette: Silhouette::Whole,
