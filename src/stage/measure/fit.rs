@@ -41,6 +41,12 @@ const SIDE_DEPTH_NONE_PX: f64 = 0.3;
 const BASE_TRUST: f64 = 0.2;
 /// In between, a top edge counts this much: enough when there is nothing better.
 const NARROW_SIDE_TRUST: f64 = 0.05;
+/// A step from a dark parcel's top straight to a brighter belt may be the border of its contact
+/// shadow: it counts this much.
+const SHADOW_TRUST: f64 = 0.2;
+/// Light comes from above: a visible side is rarely brighter than the top, and a rising step
+/// there is rather that from a dark side to the belt.
+const RISING_TRUST: f64 = 0.5;
 /// No edge of a face is further inside the silhouette than this share of the parcel.
 const INSIDE_MAX: f64 = 0.3;
 /// Profiles on neighbouring places and frames share their errors; this many count as one.
@@ -221,7 +227,7 @@ impl Problem<'_> {
 
     /// Where most profiles of the whole pass agree on an edge at each face.
     fn face_votes(&self, views: &[PassView], params: &Params) -> [FaceVote; 4] {
-        let mut votes = [[0.0f64; VOTE_BINS]; 4];
+        let mut votes = [[[0.0f64; VOTE_BINS]; 2]; 4];
         let mut depth = [(0.0, 0u32); 4];
         let mut sampled = 0;
         for view in views.iter().filter(|v| !v.samples().is_empty()) {
@@ -239,7 +245,9 @@ impl Problem<'_> {
                     let offset_px = (f64::from(step.at) - at) / self.geometry.mm_per_px;
                     let bin = ((offset_px - VOTE_FIRST_PX) / VOTE_BIN_PX).floor();
                     if (0.0..VOTE_BINS as f64).contains(&bin) {
-                        votes[sample.edge.face()][bin as usize] +=
+                        let face = sample.edge.face();
+                        let facing = outline.side_visible[face];
+                        votes[face][usize::from(facing)][bin as usize] +=
                             f64::from(step.slope.clamp(-VOTE_SLOPE_MAX, VOTE_SLOPE_MAX));
                     }
                 }
@@ -435,43 +443,50 @@ impl Problem<'_> {
         let sigma_mm = EDGE_SIGMA_PX * self.geometry.mm_per_px;
         for view in views.iter().filter(|v| !v.samples().is_empty()) {
             let outline = self.outline(view, params);
-            let trust: [f64; EDGES] = std::array::from_fn(|e| {
-                let edge = EdgeId(e as u8);
-                let depth_px = outline.side_depth_mm(edge.face()) / self.geometry.mm_per_px;
-                let facing = outline.side_visible[edge.face()];
-                // A narrow side blurs its two edges into one place that is neither.
-                let wide = depth_px > SIDE_DEPTH_MIN_PX;
-                match (edge.is_base(), facing) {
-                    (true, true) if wide => BASE_TRUST,
-                    (true, _) => 0.0,
-                    (false, true) if !wide && depth_px > SIDE_DEPTH_NONE_PX => NARROW_SIDE_TRUST,
-                    (false, _) => 1.0,
-                }
-            });
+            let trust: [[f64; 2]; EDGES] =
+                std::array::from_fn(|e| self.trust(&outline, EdgeId(e as u8)));
             for sample in view.samples() {
                 let e = usize::from(sample.edge.0);
-                if trust[e] == 0.0 {
+                if trust[e] == [0.0; 2] {
                     continue;
                 }
                 let Some((at, row)) = self.predict(&outline, sample) else { continue };
                 used.offered += 1;
-                let facing = usize::from(outline.side_visible[sample.edge.face()]);
-                let chosen = choose(sample, at, gate_mm, polarity[e][facing]);
+                let facing = outline.side_visible[sample.edge.face()];
+                let known = polarity[e][usize::from(facing)];
+                let rising = if facing && !sample.edge.is_base() { RISING_TRUST } else { 1.0 };
+                let chosen = choose(sample, at, gate_mm, known, rising);
                 let Some((residual, slope)) = chosen else { continue };
                 used.used += 1;
                 used.squares += residual * residual;
-                used.polarity[e][facing] += f64::from(slope.signum());
+                used.polarity[e][usize::from(facing)] += f64::from(slope.signum());
                 let share = residual / gate_mm;
                 let biweight = (1.0 - share * share).powi(2);
                 used.contrast += biweight * f64::from(slope.abs()).ln_1p();
+                let trust = trust[e][usize::from(slope > 0.0)];
                 normal.add(
                     residual,
                     &row,
-                    trust[e] * biweight / (CORRELATED_SAMPLES * sigma_mm * sigma_mm),
+                    trust * biweight / (CORRELATED_SAMPLES * sigma_mm * sigma_mm),
                 );
             }
         }
         used
+    }
+
+    /// How much an edge counts in one view, when it falls outward and when it rises.
+    fn trust(&self, outline: &Outline, edge: EdgeId) -> [f64; 2] {
+        let depth_px = outline.side_depth_mm(edge.face()) / self.geometry.mm_per_px;
+        // A narrow side blurs its two edges into one place that is neither.
+        let wide = depth_px > SIDE_DEPTH_MIN_PX;
+        match (edge.is_base(), outline.side_visible[edge.face()]) {
+            (true, true) if wide => [BASE_TRUST; 2],
+            (true, _) => [0.0; 2],
+            (false, true) if !wide && depth_px > SIDE_DEPTH_NONE_PX => [NARROW_SIDE_TRUST; 2],
+            (false, true) => [1.0; 2],
+            (false, false) if wide => [1.0, SHADOW_TRUST],
+            (false, false) => [1.0, NARROW_SIDE_TRUST],
+        }
     }
 
     /// Where the model's edge crosses a profile: offset from the anchor along `outward`, and
@@ -497,11 +512,13 @@ impl Problem<'_> {
     }
 }
 
-/// Offset, px, from `first_px` on, of the outermost place where the signed votes agree; `None`
-/// without votes.
-fn outermost_peak(votes: &[f64; VOTE_BINS], first_px: f64) -> Option<f64> {
+/// Offset, px, from `first_px` on, of the outermost place where the signed votes agree, those
+/// above a hidden side and those above a visible one each among themselves; `None` without votes.
+fn outermost_peak(votes: &[[f64; VOTE_BINS]; 2], first_px: f64) -> Option<f64> {
     // Neighbours within a pixel and a half are the same edge.
-    let smooth = |i: usize| votes[i - 1..=i + 1].iter().sum::<f64>().abs();
+    let smooth = |i: usize| -> f64 {
+        votes.iter().map(|votes| votes[i - 1..=i + 1].iter().sum::<f64>().abs()).sum()
+    };
     let first = ((first_px - VOTE_FIRST_PX) / VOTE_BIN_PX).ceil().max(1.0) as usize;
     let inner = || first.min(VOTE_BINS - 1)..VOTE_BINS - 1;
     let most = inner().map(smooth).fold(0.0, f64::max);
@@ -520,6 +537,7 @@ fn choose(
     predicted_mm: f64,
     gate_mm: f64,
     polarity: f64,
+    rising: f64,
 ) -> Option<(f64, f32)> {
     let mut best: Option<(f64, f64, f32)> = None;
     for step in sample.steps.iter().filter(|s| s.slope != 0.0) {
@@ -528,7 +546,8 @@ fn choose(
         if near <= 0.0 || f64::from(step.slope) * polarity < 0.0 {
             continue;
         }
-        let score = f64::from(step.slope.abs()) * near;
+        let sign = if step.slope > 0.0 { rising } else { 1.0 };
+        let score = f64::from(step.slope.abs()) * near * sign;
         if best.is_none_or(|(s, _, _)| score > s) {
             best = Some((score, residual, step.slope));
         }

@@ -59,7 +59,7 @@ pub struct Rounding {
 impl Rounding {
     /// Edges of a radius, mm.
     pub fn of_radius(radius_mm: f64) -> Self {
-        Self { inset_mm: 0.2 * radius_mm, drop_mm: 0.55 * radius_mm }
+        Self { inset_mm: 0.22 * radius_mm, drop_mm: 0.6 * radius_mm }
     }
 }
 
