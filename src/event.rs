@@ -27,8 +27,11 @@ impl Flags {
     /// Too few edges were found: size from the silhouette alone.
     pub const SILHOUETTE_ONLY: Self = Self(1 << 6);
 
+    /// Corners on the top face and its edges disagree about the height.
+    pub const HEIGHT_DISPUTED: Self = Self(1 << 9);
+
     /// Every flag: its name in records and its meaning, in bit order.
-    pub const ALL: [(Self, &'static str, &'static str); 9] = [
+    pub const ALL: [(Self, &'static str, &'static str); 10] = [
         (Self::UNFINISHED, "unfinished", "still inside when the input ended"),
         (Self::MERGED, "merged", "its image ran together with a neighbour's for some of the pass"),
         (
@@ -49,6 +52,11 @@ impl Flags {
             Self::FOOTPRINT_UNCERTAIN,
             "footprint_uncertain",
             "standard deviation of length or width above 3 mm",
+        ),
+        (
+            Self::HEIGHT_DISPUTED,
+            "height_disputed",
+            "texture on the top and its edges disagree about the height",
         ),
     ];
 
@@ -98,7 +106,7 @@ impl serde::Serialize for Flags {
 pub enum Shape {
     /// The edges of a cuboid were found where it says.
     Box,
-    /// Anything else; the dimensions are of the cuboid that fits best.
+    /// Anything else; the dimensions are of the smallest upright cuboid that holds it.
     Irregular,
 }
 

@@ -12,7 +12,7 @@ use crate::image::{FrameTime, Plane};
 use crate::kernel::scalar::bits::{self, dilate3x3, words};
 use crate::plan::{Block, Memory, Plan};
 use crate::stage::background::Background;
-use crate::stage::measure::{self, Estimate, Frame, Measure};
+use crate::stage::measure::{self, Frame, Measure, Measured};
 use crate::stage::odometry::Odometry;
 use crate::stage::rectify::Rectify;
 use crate::stage::segment::{PxBox, Segment};
@@ -20,8 +20,6 @@ use crate::stage::track::{Change, NOBODY, Phase, Track, Tracker};
 use crate::units::{BeltPx, BeltRect};
 use nalgebra::Vector2;
 
-/// Below this share of profiles with an edge where the cuboid has one, it is no cuboid.
-const BOX_EDGE_SHARE_MIN: f64 = 0.5;
 /// Above this sigma a dimension is flagged.
 const SIGMA_MAX_MM: f64 = 3.0;
 /// Above this relative sigma the belt speed counts as assumed.
@@ -284,32 +282,31 @@ impl Pipeline {
             return;
         }
         let reference = self.references[slot];
-        let estimate = self.measure.finish(slot, reference.at);
+        let measured = self.measure.finish(slot, reference.at);
         // A pass that was cut short counts only if it could be measured.
-        let estimate = estimate.filter(|e| e.edge_count > 0 || flags == Flags::default());
-        let Some(estimate) = estimate else {
+        let measured = measured.filter(|m| m.has_edges || flags == Flags::default());
+        let Some(measured) = measured else {
             self.counters.unmeasured += 1;
             return;
         };
         self.counters.parcels += 1;
-        let record = self.record(slot, &estimate, reference, flags);
+        let record = self.record(slot, &measured, reference, flags);
         emit(record);
     }
 
     fn record(
         &self,
         slot: usize,
-        fit: &Estimate,
+        measured: &Measured,
         reference: Reference,
         flags: Flags,
     ) -> ParcelRecord {
         let track = &self.tracker.tracks()[slot];
-        let (p, s) = (&fit.params, &fit.sigma);
+        let (p, s) = (&measured.estimate.params, &measured.estimate.sigma);
         let travel_sigma = self.at.sigma_since(&track.first);
         let elapsed_s = self.last.map_or(0.0, |last| last.t_s - reference.began_s);
         let travel_mm = self.at.travel_mm - track.first.travel_mm;
-        let shape =
-            if fit.edge_share >= BOX_EDGE_SHARE_MIN { Shape::Box } else { Shape::Irregular };
+        let shape = if measured.is_box { Shape::Box } else { Shape::Irregular };
         let mut record = ParcelRecord {
             seq: self.counters.parcels as u32,
             frame: reference.time.index,
@@ -335,7 +332,8 @@ impl Pipeline {
         record.flags.set(Flags::FOOTPRINT_UNCERTAIN, footprint_sigma_mm > SIGMA_MAX_MM);
         record.flags.set(Flags::SPEED_ASSUMED, travel_sigma > SPEED_SIGMA_MAX);
         record.flags.set(Flags::TOO_TALL, record.height_mm > self.site.height_max_mm);
-        record.flags.set(Flags::SILHOUETTE_ONLY, fit.edge_count == 0);
+        record.flags.set(Flags::SILHOUETTE_ONLY, !measured.has_edges);
+        record.flags.set(Flags::HEIGHT_DISPUTED, measured.disputed);
         record.rounded()
     }
 

@@ -2,6 +2,7 @@
 
 pub mod bits;
 pub mod correlate;
+pub mod flow;
 pub mod mixture;
 pub mod profile;
 pub mod remap;

@@ -5,6 +5,7 @@
 //! closes. The silhouettes stay in with low weight: they guard the choice of edges.
 //! Source: Nocedal and Wright, chapter 10; Huber 1964 and Tukey's biweight for outliers.
 
+use super::corners::TopMotion;
 use super::model::{
     DIRECTIONS, EDGES, EdgeId, HEIGHT, LENGTH, N, Outline, Params, Rounding, SCALE, WIDTH, X, Y,
     YAW, canonical, direction,
@@ -24,17 +25,8 @@ const EDGE_SIGMA_PX: f64 = 0.35;
 const GATES_PX: [f64; 12] = [6.0, 6.0, 5.0, 4.0, 3.0, 2.5, 2.0, 2.0, 2.0, 2.0, 2.0, 2.0];
 /// An edge's polarity is settled once the gate is this narrow, px.
 const POLARITY_GATE_PX: f64 = 5.0;
-/// Votes on where a face's top edge is, relative to the silhouette's: bins of half a pixel,
-/// from well inside (shadows and dark sides widen a silhouette) to a little outside.
-const VOTE_BINS: usize = 76;
-const VOTE_BIN_PX: f64 = 0.5;
-const VOTE_FIRST_PX: f64 = -30.0;
-/// Steeper than this votes no more: a label must not outvote an edge.
-const VOTE_SLOPE_MAX: f32 = 4.0;
-/// The outermost place with this share of the most votes is the edge; stripes lie inside it.
-const VOTE_SHARE: f64 = 0.85;
 /// A base edge nearer than this to its top edge cannot be told from it.
-const SIDE_DEPTH_MIN_PX: f64 = 4.0;
+pub(super) const SIDE_DEPTH_MIN_PX: f64 = 4.0;
 /// A side narrower than this does not disturb its top edge.
 const SIDE_DEPTH_NONE_PX: f64 = 0.3;
 /// Contact shadows pull base edges outward by a pixel or two: they count this much.
@@ -47,12 +39,21 @@ const SHADOW_TRUST: f64 = 0.2;
 /// Light comes from above: a visible side is rarely brighter than the top, and a rising step
 /// there is rather that from a dark side to the belt.
 const RISING_TRUST: f64 = 0.5;
-/// No edge of a face is further inside the silhouette than this share of the parcel.
-const INSIDE_MAX: f64 = 0.3;
+/// A mean square silhouette residual that costs half of a fit's contrast. Shadows alone make 10
+/// of it.
+const REACH_ERROR_HALVES: f64 = 50.0;
+/// Where an enclosing cuboid is larger than what it encloses, that counts this much.
+const INSIDE_WEIGHT: f64 = 0.1;
 /// Profiles on neighbouring places and frames share their errors; this many count as one.
 const CORRELATED_SAMPLES: f64 = 20.0;
 /// Below this no dimension is trusted, mm: lens model, edge rounding.
 const SIGMA_FLOOR_MM: f64 = 0.3;
+/// The height from edges alone depends twice as much on their rounding, and on shadows.
+const EDGE_HEIGHT_SIGMA_MM: f64 = 0.8;
+/// What a shape that is no box leaves open.
+const ENCLOSING_SIGMA_MM: f64 = 4.0;
+/// Edges and corners that differ by more than so many sigma do not mean the same top face.
+const DISPUTED_SIGMA: f64 = 3.0;
 /// Dimensions below this are no parcel.
 const SIDE_MIN_MM: f64 = 5.0;
 
@@ -73,6 +74,10 @@ pub struct Problem<'a> {
     pub travel_sigma: f64,
     /// Which silhouettes: of the whole blob, or without its dark parts.
     pub silhouette: Silhouette,
+    /// The cuboid need not fill the silhouettes, but hold them.
+    pub enclosing: bool,
+    /// What corners on the top face tell.
+    pub top_motion: Option<TopMotion>,
 }
 
 /// Which of a view's reaches.
@@ -99,14 +104,6 @@ pub struct Estimate {
     pub edge_contrast: f64,
     /// Weighted mean square of the silhouette residuals, in units of their sigma.
     pub reach_error: f64,
-}
-
-/// What the profiles say about a face.
-struct FaceVote {
-    /// Outward from the silhouette's face to the edge agreed upon, mm.
-    offset_mm: f64,
-    /// How far its base edge appears outside its top edge, where that could be mistaken.
-    side_depth_mm: Option<f64>,
 }
 
 /// Sums of a least squares problem.
@@ -154,9 +151,20 @@ struct EdgeUse {
     polarity: Polarity,
 }
 
+impl Estimate {
+    /// What tells a right fit from a wrong one: contrast, less what the silhouettes disagree; of
+    /// silhouettes alone, their agreement.
+    pub fn score(&self) -> f64 {
+        if self.edge_count == 0 {
+            return -self.reach_error;
+        }
+        self.edge_contrast / (1.0 + self.reach_error / REACH_ERROR_HALVES)
+    }
+}
+
 impl Problem<'_> {
     /// Where a view should show the edges of a cuboid.
-    fn outline(&self, view: &PassView, params: &Params) -> Outline {
+    pub(super) fn outline(&self, view: &PassView, params: &Params) -> Outline {
         let travel_mm = view.travel_mm - self.reference_travel_mm;
         Outline::rounded(self.geometry, self.rounding, params, travel_mm)
     }
@@ -179,6 +187,28 @@ impl Problem<'_> {
         self.estimate(params, &normal, reach_error, &EdgeUse::default())
     }
 
+    /// The smallest upright cuboid that holds the silhouettes, as high as the highest texture.
+    pub fn fit_enclosing(&self, views: &[PassView]) -> Option<Estimate> {
+        let highest = |top: TopMotion| TopMotion { ratio: top.highest, ..top };
+        let enclosing = Self { enclosing: true, top_motion: self.top_motion.map(highest), ..*self };
+        let mut estimate = enclosing.fit_reach(views, None)?;
+        for i in [X, Y, LENGTH, WIDTH, HEIGHT] {
+            estimate.sigma[i] = estimate.sigma[i].hypot(ENCLOSING_SIGMA_MM);
+        }
+        Some(estimate)
+    }
+
+    /// Whether edges alone, without the corners, put the top face far from `estimate`'s.
+    pub fn height_disputed(&self, views: &[PassView], estimate: &Estimate) -> bool {
+        let edges = Self { top_motion: None, ..*self };
+        let without = edges.refine_edges(views, estimate.params);
+        self.top_motion.is_some()
+            && without.is_some_and(|e| {
+                let difference_mm = (e.params[HEIGHT] - estimate.params[HEIGHT]).abs();
+                difference_mm > DISPUTED_SIGMA * e.sigma[HEIGHT].hypot(estimate.sigma[HEIGHT])
+            })
+    }
+
     /// Fit edges, starting from an estimate of the silhouettes. On a side that faces the camera
     /// the strongest edge may be the top one or the one on the belt: both are tried, and the
     /// cuboid that explains more contrast is kept.
@@ -195,8 +225,8 @@ impl Problem<'_> {
                 found[k].offset_mm - depth.unwrap_or(0.0)
             });
             let fitted = self.refine_edges(views, self.moved(start, offsets));
-            let contrast = |e: &Option<Estimate>| e.map_or(f64::NEG_INFINITY, |e| e.edge_contrast);
-            if contrast(&fitted) > contrast(&best) {
+            let score = |e: &Option<Estimate>| e.map_or(f64::NEG_INFINITY, |e| e.score());
+            if score(&fitted) > score(&best) {
                 best = fitted;
             }
         }
@@ -223,52 +253,6 @@ impl Problem<'_> {
         // Silhouettes are biased by shadows: they guide, but make nothing more certain.
         let (normal, reach_error, used) = last?;
         self.estimate(params, &normal, reach_error, &used)
-    }
-
-    /// Where most profiles of the whole pass agree on an edge at each face.
-    fn face_votes(&self, views: &[PassView], params: &Params) -> [FaceVote; 4] {
-        let mut votes = [[[0.0f64; VOTE_BINS]; 2]; 4];
-        let mut depth = [(0.0, 0u32); 4];
-        let mut sampled = 0;
-        for view in views.iter().filter(|v| !v.samples().is_empty()) {
-            let outline = self.outline(view, params);
-            sampled += 1;
-            for (k, (sum, count)) in depth.iter_mut().enumerate() {
-                if outline.side_visible[k] {
-                    *sum += outline.side_depth_mm(k);
-                    *count += 1;
-                }
-            }
-            for sample in view.samples().iter().filter(|s| !s.edge.is_base()) {
-                let Some((at, _)) = self.predict(&outline, sample) else { continue };
-                for step in sample.steps.iter().filter(|s| s.slope != 0.0) {
-                    let offset_px = (f64::from(step.at) - at) / self.geometry.mm_per_px;
-                    let bin = ((offset_px - VOTE_FIRST_PX) / VOTE_BIN_PX).floor();
-                    if (0.0..VOTE_BINS as f64).contains(&bin) {
-                        let face = sample.edge.face();
-                        let facing = outline.side_visible[face];
-                        votes[face][usize::from(facing)][bin as usize] +=
-                            f64::from(step.slope.clamp(-VOTE_SLOPE_MAX, VOTE_SLOPE_MAX));
-                    }
-                }
-            }
-        }
-        let m = self.geometry.magnification(params[HEIGHT]);
-        std::array::from_fn(|k| {
-            let (sum, count) = depth[k];
-            let mean = sum / f64::from(count.max(1));
-            // A side seen in passing shows its base edge smeared: no peak to mistake.
-            let confusing =
-                2 * count > sampled && mean > SIDE_DEPTH_MIN_PX * self.geometry.mm_per_px;
-            // An edge further inside than this is the other side's, or a stripe's.
-            let extent_mm = params[if k % 2 == 0 { LENGTH } else { WIDTH }];
-            let inside_px = INSIDE_MAX * m * extent_mm / self.geometry.mm_per_px;
-            FaceVote {
-                offset_mm: outermost_peak(&votes[k], -inside_px)
-                    .map_or(0.0, |px| px * self.geometry.mm_per_px / m),
-                side_depth_mm: confusing.then_some(mean / m),
-            }
-        })
     }
 
     /// The cuboid with its four faces moved outward.
@@ -304,6 +288,9 @@ impl Problem<'_> {
         let mut sigma = covariance.diagonal().map(|v| (excess * v.max(0.0)).sqrt());
         for i in [X, Y, LENGTH, WIDTH, HEIGHT] {
             sigma[i] = sigma[i].hypot(SIGMA_FLOOR_MM);
+        }
+        if self.top_motion.is_none() {
+            sigma[HEIGHT] = sigma[HEIGHT].hypot(EDGE_HEIGHT_SIGMA_MM);
         }
         Some(Estimate {
             params,
@@ -390,6 +377,12 @@ impl Problem<'_> {
         // Keeps the height determined while the baseline is still short.
         let middle = 0.25 * self.height_max_mm;
         normal.add(middle - params[HEIGHT], &axis(HEIGHT), (4.0 * middle).powi(-2));
+        if let Some(top) = &self.top_motion {
+            let m = self.geometry.magnification(params[HEIGHT]);
+            let mut row = axis(SCALE) * m;
+            row[HEIGHT] = params[SCALE] * m * m / self.geometry.camera_height_mm;
+            normal.add(top.ratio - params[SCALE] * m, &row, top.sigma.powi(-2));
+        }
         // Next to nothing, so that what no edge shows is uncertain instead of singular.
         for i in [X, Y, YAW, LENGTH, WIDTH] {
             normal.add(0.0, &axis(i), 1e-5);
@@ -421,7 +414,8 @@ impl Problem<'_> {
                 let vertex = outline.support(d);
                 let residual = f64::from(reach) - vertex.image.dot(&d);
                 let row = vertex.jacobian.transpose() * d;
-                let huber = (1.5 * sigma_mm / residual.abs().max(1e-9)).min(1.0);
+                let inside = if self.enclosing && residual < 0.0 { INSIDE_WEIGHT } else { 1.0 };
+                let huber = inside * (1.5 * sigma_mm / residual.abs().max(1e-9)).min(1.0);
                 normal.add(residual, &row, huber / (CORRELATED_SAMPLES * sigma_mm * sigma_mm));
                 squares += huber * residual * residual;
                 count += 1;
@@ -491,7 +485,11 @@ impl Problem<'_> {
 
     /// Where the model's edge crosses a profile: offset from the anchor along `outward`, and
     /// its derivative. `None` when the profile misses the edge or that part is not in the zone.
-    fn predict(&self, outline: &Outline, sample: &EdgeSample) -> Option<(f64, SVector<f64, N>)> {
+    pub(super) fn predict(
+        &self,
+        outline: &Outline,
+        sample: &EdgeSample,
+    ) -> Option<(f64, SVector<f64, N>)> {
         let [a, b] = outline.ends(sample.edge);
         let anchor = Vector2::from(sample.anchor.map(f64::from));
         let outward = Vector2::from(sample.outward.map(f64::from));
@@ -510,24 +508,6 @@ impl Problem<'_> {
         let jacobian = a.jacobian * (1.0 - t) + b.jacobian * t;
         Some((at, jacobian.transpose() * normal / facing))
     }
-}
-
-/// Offset, px, from `first_px` on, of the outermost place where the signed votes agree, those
-/// above a hidden side and those above a visible one each among themselves; `None` without votes.
-fn outermost_peak(votes: &[[f64; VOTE_BINS]; 2], first_px: f64) -> Option<f64> {
-    // Neighbours within a pixel and a half are the same edge.
-    let smooth = |i: usize| -> f64 {
-        votes.iter().map(|votes| votes[i - 1..=i + 1].iter().sum::<f64>().abs()).sum()
-    };
-    let first = ((first_px - VOTE_FIRST_PX) / VOTE_BIN_PX).ceil().max(1.0) as usize;
-    let inner = || first.min(VOTE_BINS - 1)..VOTE_BINS - 1;
-    let most = inner().map(smooth).fold(0.0, f64::max);
-    let peak = inner().rev().find(|&i| {
-        let here = smooth(i);
-        let below = i + 1 == VOTE_BINS - 1 || smooth(i + 1) <= here;
-        most > 0.0 && here >= VOTE_SHARE * most && below && (i == first || smooth(i - 1) <= here)
-    })?;
-    Some(VOTE_FIRST_PX + (peak as f64 + 0.5) * VOTE_BIN_PX)
 }
 
 /// The step that belongs to the predicted edge: inside the gate, of the edge's polarity once

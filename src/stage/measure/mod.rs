@@ -7,9 +7,11 @@
 //! two silhouettes from three starts each, then up to eight starts of twelve Gauss-Newton
 //! steps on the edges.
 
+mod corners;
 mod fit;
 mod model;
 mod observe;
+mod votes;
 
 pub use fit::Estimate;
 pub use model::{HEIGHT, LENGTH, Outline, Params, Rounding, SCALE, WIDTH, X, Y, YAW};
@@ -21,6 +23,7 @@ use crate::error::Result;
 use crate::kernel::scalar::runs::Run;
 use crate::plan::{Block, Memory, Plan};
 use crate::units::BeltRect;
+use corners::{CORNERS, Corner, top_motion};
 use fit::{Problem, Silhouette, canonical_estimate};
 use observe::PassView;
 
@@ -36,6 +39,22 @@ const REFIT_VIEWS: usize = 4;
 const VIEWS_PER_ZONE: f64 = 60.0;
 /// Fewer profiles than this cannot carry the fit.
 const EDGE_COUNT_MIN: usize = 60;
+
+/// Below this share of profiles with an edge where the cuboid has one, it is no cuboid.
+const BOX_EDGE_SHARE_MIN: f64 = 0.78;
+
+/// The result of a pass.
+#[derive(Clone, Copy, Debug)]
+pub struct Measured {
+    /// The cuboid, or the smallest one that holds what is none.
+    pub estimate: Estimate,
+    /// Its edges are those of a cuboid.
+    pub is_box: bool,
+    /// Edges were found, be they a cuboid's or not.
+    pub has_edges: bool,
+    /// Corners on the top face and its edges disagree about the height.
+    pub disputed: bool,
+}
 
 /// State of one track's pass.
 #[derive(Clone, Copy)]
@@ -61,6 +80,7 @@ pub struct Measure {
     views_per_track: usize,
     views: Block<PassView>,
     passes: Block<Pass>,
+    corners: Block<Corner>,
 }
 
 impl Measure {
@@ -72,6 +92,7 @@ impl Measure {
             "limits.tracks_max x limits.views_per_track_max",
         );
         plan.add::<Pass>("measure.passes", tracks_max, "limits.tracks_max");
+        plan.add::<Corner>("measure.corners", tracks_max * CORNERS, "20 for each track");
     }
 
     /// No passes yet.
@@ -101,11 +122,13 @@ impl Measure {
             views_per_track,
             views: memory.take("measure.views", PassView::EMPTY)?,
             passes: memory.take("measure.passes", empty)?,
+            corners: memory.take("measure.corners", Corner::EMPTY)?,
         })
     }
 
     /// Begin a pass.
     pub fn begin(&mut self, slot: usize, at: BeltPosition) {
+        self.corners[slot * CORNERS..][..CORNERS].fill(Corner::EMPTY);
         self.passes[slot] = Pass {
             view_count: 0,
             directions: [0; 2],
@@ -135,7 +158,16 @@ impl Measure {
         view.reach_mm = frame.reach(runs);
         if let Some(estimate) = &pass.estimate {
             let travel = at.travel_mm - pass.first.travel_mm;
-            frame.sample_edges(&Outline::new(&self.geometry, &estimate.params, travel), &mut view);
+            let outline = Outline::new(&self.geometry, &estimate.params, travel);
+            frame.sample_edges(&outline, &mut view);
+            let corners = &mut self.corners[slot * CORNERS..][..CORNERS];
+            let ratio =
+                estimate.params[SCALE] * self.geometry.magnification(estimate.params[HEIGHT]);
+            corners::follow(corners, &self.geometry, frame.grey, at.travel_mm, ratio);
+            // Chosen once the estimate is new: an early, wrong one predicts wrong places.
+            if pass.since_fit == 0 {
+                corners::choose(corners, &self.geometry, frame.grey, &outline, at.travel_mm);
+            }
         }
         let reach_count = view.reach_count();
         if reach_count == [0; 2] && view.samples().is_empty() {
@@ -201,7 +233,13 @@ impl Measure {
             reference_travel_mm: pass.first.travel_mm,
             travel_sigma: pass.last.sigma_since(&pass.first),
             silhouette,
+            enclosing: false,
+            top_motion: top_motion(self.corners(slot), self.zone.length_mm()),
         }
+    }
+
+    fn corners(&self, slot: usize) -> &[Corner] {
+        &self.corners[slot * CORNERS..][..CORNERS]
     }
 
     /// The cuboid at belt position `at`, by the current estimate.
@@ -211,25 +249,43 @@ impl Measure {
         Some(Outline::new(&self.geometry, &estimate.params, at.travel_mm - pass.first.travel_mm))
     }
 
-    /// The final estimate, X at belt position `at`, length >= width: of the whole blob and of
-    /// its bright part, the cuboid whose edges show more contrast.
-    pub fn finish(&mut self, slot: usize, at: BeltPosition) -> Option<Estimate> {
-        let whole = self.fit(slot, Silhouette::Whole);
-        let bright = self.fit(slot, Silhouette::Bright);
-        let contrast = |e: &Option<Estimate>| e.map_or(-1.0, |e| e.edge_contrast);
-        let best = if contrast(&bright) > contrast(&whole) { bright } else { whole };
-        let mut estimate = best.or(self.passes[slot].estimate)?;
+    /// The final estimate, X at belt position `at`, length >= width.
+    pub fn finish(&self, slot: usize, at: BeltPosition) -> Option<Measured> {
+        let cuboid = self.best(slot, |problem, views| {
+            let reach = problem.fit_reach(views, None)?;
+            let edges = problem.fit_edges(views, reach.params);
+            edges.filter(|e| e.edge_count >= EDGE_COUNT_MIN).or(Some(reach))
+        });
+        let mut result = match cuboid {
+            Some(cuboid) if cuboid.edge_share >= BOX_EDGE_SHARE_MIN => {
+                let problem = self.problem(slot, Silhouette::Whole);
+                let disputed = problem.height_disputed(self.views(slot), &cuboid);
+                Measured { estimate: cuboid, is_box: true, has_edges: true, disputed }
+            }
+            other => {
+                let enclosing = self.best(slot, |problem, views| problem.fit_enclosing(views));
+                let estimate = enclosing.or(other).or(self.passes[slot].estimate)?;
+                let has_edges = other.is_some_and(|e| e.edge_count > 0);
+                Measured { estimate, is_box: false, has_edges, disputed: false }
+            }
+        };
         let travel = at.travel_mm - self.passes[slot].first.travel_mm;
-        estimate.params[X] += estimate.params[SCALE] * travel;
-        Some(canonical_estimate(estimate))
+        let params = &mut result.estimate.params;
+        params[X] += params[SCALE] * travel;
+        result.estimate = canonical_estimate(result.estimate);
+        Some(result)
     }
 
-    /// Silhouettes of the whole pass from scratch, then its edges.
-    fn fit(&self, slot: usize, silhouette: Silhouette) -> Option<Estimate> {
-        let (problem, views) = (self.problem(slot, silhouette), self.views(slot));
-        let reach = problem.fit_reach(views, None)?;
-        let edges = problem.fit_edges(views, reach.params);
-        Some(edges.filter(|e| e.edge_count >= EDGE_COUNT_MIN).unwrap_or(reach))
+    /// The better fit of the whole blob and of its bright part.
+    fn best(
+        &self,
+        slot: usize,
+        fit: impl Fn(&Problem<'_>, &[PassView]) -> Option<Estimate>,
+    ) -> Option<Estimate> {
+        let [whole, bright] = [Silhouette::Whole, Silhouette::Bright]
+            .map(|silhouette| fit(&self.problem(slot, silhouette), self.views(slot)));
+        let score = |e: &Option<Estimate>| e.map_or(f64::NEG_INFINITY, |e| e.score());
+        if score(&bright) > score(&whole) { bright } else { whole }
     }
 }
 
@@ -276,6 +332,8 @@ mod tests {
             reference_travel_mm: 0.0,
             travel_sigma,
             silhouette: Silhouette::Whole,
+            enclosing: false,
+            top_motion: None,
         };
         let reach = problem.fit_reach(views, None)?;
         problem.fit_edges(views, reach.params).map(canonical_estimate)

@@ -1,0 +1,189 @@
+//! Corners on the top face, followed through the pass: a second witness of the height.
+//!
+//! The top face is parallel to the belt, so in the belt view it only shifts, at the belt's speed
+//! times the magnification of its height. Each corner is matched with the patch of the frame
+//! in which it was chosen, so nothing drifts; its ratio is the slope of a straight line through
+//! its places over the belt's travel.
+
+use super::model::Outline;
+use crate::camera::BeltView;
+use crate::image::Plane;
+use crate::kernel::scalar::flow::Patch;
+use crate::units::BeltMm;
+use nalgebra::Vector2;
+
+/// Cells of the top face along and across; the best corner of each is followed.
+const CELLS: [usize; 2] = [5, 4];
+/// Corners of a parcel.
+pub const CORNERS: usize = CELLS[0] * CELLS[1];
+/// Places looked at in each cell, along and across.
+const PLACES: usize = 9;
+/// Corners are chosen this far inside the outline, as a share of the side: its edges are not.
+const INSIDE: f64 = 0.1;
+/// A weaker corner, (grey levels a px)^2, drowns in noise: its mean gradient would be 3 levels.
+const EIGENVALUE_MIN: f32 = 10.0;
+/// A corner that leaves its row by this much is a reflection or something else, px.
+const ROW_MAX_PX: f32 = 0.7;
+/// Over less travel a corner's own line does not predict its place, mm.
+const OWN_LINE_MM: f64 = 60.0;
+/// A corner tells the height once it was followed over this share of the zone, ...
+const TRAVEL_MIN: f64 = 0.25;
+/// ... in this many views.
+const VIEWS_MIN: u32 = 6;
+/// Ratios that agree within this belong to one plane: 3 mm of height under a camera at 1.5 m.
+const AGREE: f64 = 0.002;
+/// So many must agree.
+const AGREE_MIN: usize = 3;
+/// Standard uncertainty that remains: interpolation, lens.
+const RATIO_SIGMA_MIN: f64 = 0.0002;
+
+/// A corner on its way. Places are image columns in mm from where it was chosen.
+#[derive(Clone, Copy, Debug)]
+pub struct Corner {
+    patch: Patch,
+    start_px: [f32; 2],
+    start_travel_mm: f64,
+    /// Views it was found in, and the sums of its straight line: t, x, tt, tx.
+    views: u32,
+    sums: [f64; 4],
+    followed: bool,
+    travel_mm: f64,
+}
+
+impl Corner {
+    /// None.
+    pub const EMPTY: Self = Self {
+        patch: Patch::EMPTY,
+        start_px: [0.0; 2],
+        start_travel_mm: 0.0,
+        views: 0,
+        sums: [0.0; 4],
+        followed: false,
+        travel_mm: 0.0,
+    };
+
+    fn begin(patch: Patch, px: [usize; 2], travel_mm: f64) -> Self {
+        let start_px = px.map(|c| c as f32);
+        Self {
+            patch,
+            start_px,
+            start_travel_mm: travel_mm,
+            followed: true,
+            views: 1,
+            ..Self::EMPTY
+        }
+    }
+
+    fn slope(&self) -> f64 {
+        let n = f64::from(self.views);
+        let [t, x, tt, tx] = self.sums;
+        (n * tx - t * x) / (n * tt - t * t)
+    }
+
+    /// Image travel over belt travel, once it is known.
+    fn ratio(&self, zone_length_mm: f64) -> Option<f64> {
+        let seen = self.views >= VIEWS_MIN && self.travel_mm >= TRAVEL_MIN * zone_length_mm;
+        seen.then(|| self.slope()).filter(|r| r.is_finite())
+    }
+
+    fn follow(&mut self, view: &BeltView, grey: Plane<'_>, travel_mm: f64, ratio: f64) {
+        let t_mm = travel_mm - self.start_travel_mm;
+        let ratio = if self.travel_mm > OWN_LINE_MM { self.slope() } else { ratio };
+        let near = [self.start_px[0] + (ratio * t_mm / view.mm_per_px) as f32, self.start_px[1]];
+        let found = self.patch.find(grey, near);
+        let Some([u, _]) = found.filter(|at| (at[1] - near[1]).abs() <= ROW_MAX_PX) else {
+            self.followed = false;
+            return;
+        };
+        let x_mm = f64::from(u - self.start_px[0]) * view.mm_per_px;
+        self.views += 1;
+        self.travel_mm = t_mm;
+        for (sum, more) in self.sums.iter_mut().zip([t_mm, x_mm, t_mm * t_mm, t_mm * x_mm]) {
+            *sum += more;
+        }
+    }
+}
+
+/// What the corners agree upon.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct TopMotion {
+    /// Image travel over belt travel of the plane that most corners are on.
+    pub ratio: f64,
+    /// Its standard uncertainty, besides that of the belt's travel.
+    pub sigma: f64,
+    /// The largest ratio that two corners share: the highest texture there is.
+    pub highest: f64,
+}
+
+/// Follow the corners into a new view. `ratio`: expected image travel over belt travel.
+pub fn follow(
+    corners: &mut [Corner],
+    view: &BeltView,
+    grey: Plane<'_>,
+    travel_mm: f64,
+    ratio: f64,
+) {
+    for corner in corners.iter_mut().filter(|c| c.followed) {
+        corner.follow(view, grey, travel_mm, ratio);
+    }
+}
+
+/// The best corner of each cell of the top face, unless some are being followed.
+pub fn choose(
+    corners: &mut [Corner],
+    view: &BeltView,
+    grey: Plane<'_>,
+    outline: &Outline,
+    travel_mm: f64,
+) {
+    if corners.iter().any(|c| c.followed) {
+        return;
+    }
+    let [a, b, _, d] = outline.top.each_ref().map(|v| v.image);
+    let inside = |t: f64| INSIDE + (1.0 - 2.0 * INSIDE) * t;
+    let at = |s: f64, t: f64| a + (b - a) * inside(t) + (d - a) * inside(s);
+    for (k, corner) in corners.iter_mut().enumerate().take(CORNERS) {
+        if corner.views >= VIEWS_MIN {
+            continue;
+        }
+        let cell = [k % CELLS[0], k / CELLS[0]];
+        let place = |axis: usize, i: usize| {
+            (cell[axis] as f64 + (i as f64 + 0.5) / PLACES as f64) / CELLS[axis] as f64
+        };
+        let mut best = EIGENVALUE_MIN;
+        for (i, j) in (0..PLACES).flat_map(|i| (0..PLACES).map(move |j| (i, j))) {
+            let Some(px) = pixel(view, at(place(0, i), place(1, j))) else { continue };
+            let Some(patch) = Patch::cut(grey, px[0], px[1]) else { continue };
+            let score = patch.minimum_eigenvalue();
+            if score > best {
+                best = score;
+                *corner = Corner::begin(patch, px, travel_mm);
+            }
+        }
+    }
+}
+
+fn pixel(view: &BeltView, at: Vector2<f64>) -> Option<[usize; 2]> {
+    let px = view.px(BeltMm { x: at.x, y: at.y });
+    (px.u >= 0.0 && px.v >= 0.0).then_some([px.u.round() as usize, px.v.round() as usize])
+}
+
+/// The motion that most corners share; `None` when too few agree.
+pub fn top_motion(corners: &[Corner], zone_length_mm: f64) -> Option<TopMotion> {
+    let mut ratios: heapless::Vec<f64, CORNERS> =
+        corners.iter().take(CORNERS).filter_map(|c| c.ratio(zone_length_mm)).collect();
+    ratios.sort_unstable_by(f64::total_cmp);
+    let agreeing = |ratio: f64| ratios.iter().filter(move |r| (**r - ratio).abs() <= AGREE);
+    // Of equal crowds the higher one: what is below the top face is on a side or a lid's flap.
+    let crowd = ratios.iter().copied().max_by_key(|&r| agreeing(r).count())?;
+    let count = agreeing(crowd).count();
+    if count < AGREE_MIN.max(ratios.len() / 2) {
+        return None;
+    }
+    let mean = agreeing(crowd).sum::<f64>() / count as f64;
+    let variance = agreeing(crowd).map(|r| (r - mean).powi(2)).sum::<f64>() / (count - 1) as f64;
+    let sigma = (variance / count as f64).sqrt().hypot(RATIO_SIGMA_MIN);
+    let shared = |pair: &&[f64]| pair[1] - pair[0] <= AGREE;
+    let highest = ratios.windows(2).filter(shared).next_back().map_or(mean, |pair| pair[0]);
+    Some(TopMotion { ratio: mean, sigma, highest })
+}

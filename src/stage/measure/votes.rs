@@ -1,0 +1,92 @@
+//! Votes of all profiles of a pass on where each face's top edge is: what brings the fit near
+//! enough to choose the right steps.
+
+use super::fit::{Problem, SIDE_DEPTH_MIN_PX};
+use super::model::{HEIGHT, LENGTH, Params, WIDTH};
+use super::observe::PassView;
+
+/// Votes on where a face's top edge is, relative to the silhouette's: bins of half a pixel,
+/// from well inside (shadows and dark sides widen a silhouette) to a little outside.
+const VOTE_BINS: usize = 76;
+const VOTE_BIN_PX: f64 = 0.5;
+const VOTE_FIRST_PX: f64 = -30.0;
+/// Steeper than this votes no more: a label must not outvote an edge.
+const VOTE_SLOPE_MAX: f32 = 1.5;
+/// The outermost place with this share of the most votes is the edge; stripes lie inside it.
+const VOTE_SHARE: f64 = 0.85;
+/// No edge of a face is further inside the silhouette than this share of the parcel.
+const INSIDE_MAX: f64 = 0.3;
+
+/// What the profiles say about a face.
+pub struct FaceVote {
+    /// Outward from the silhouette's face to the edge agreed upon, mm.
+    pub offset_mm: f64,
+    /// How far its base edge appears outside its top edge, where that could be mistaken.
+    pub side_depth_mm: Option<f64>,
+}
+
+impl Problem<'_> {
+    /// Where most profiles of the whole pass agree on an edge at each face.
+    pub(super) fn face_votes(&self, views: &[PassView], params: &Params) -> [FaceVote; 4] {
+        let mut votes = [[[0.0f64; VOTE_BINS]; 2]; 4];
+        let mut depth = [(0.0, 0u32); 4];
+        let mut sampled = 0;
+        for view in views.iter().filter(|v| !v.samples().is_empty()) {
+            let outline = self.outline(view, params);
+            sampled += 1;
+            for (k, (sum, count)) in depth.iter_mut().enumerate() {
+                if outline.side_visible[k] {
+                    *sum += outline.side_depth_mm(k);
+                    *count += 1;
+                }
+            }
+            for sample in view.samples().iter().filter(|s| !s.edge.is_base()) {
+                let Some((at, _)) = self.predict(&outline, sample) else { continue };
+                for step in sample.steps.iter().filter(|s| s.slope != 0.0) {
+                    let offset_px = (f64::from(step.at) - at) / self.geometry.mm_per_px;
+                    let bin = ((offset_px - VOTE_FIRST_PX) / VOTE_BIN_PX).floor();
+                    if (0.0..VOTE_BINS as f64).contains(&bin) {
+                        let face = sample.edge.face();
+                        let facing = outline.side_visible[face];
+                        votes[face][usize::from(facing)][bin as usize] +=
+                            f64::from(step.slope.clamp(-VOTE_SLOPE_MAX, VOTE_SLOPE_MAX));
+                    }
+                }
+            }
+        }
+        let m = self.geometry.magnification(params[HEIGHT]);
+        std::array::from_fn(|k| {
+            let (sum, count) = depth[k];
+            let mean = sum / f64::from(count.max(1));
+            // A side seen in passing shows its base edge smeared: no peak to mistake.
+            let confusing =
+                2 * count > sampled && mean > SIDE_DEPTH_MIN_PX * self.geometry.mm_per_px;
+            // An edge further inside than this is the other side's, or a stripe's.
+            let extent_mm = params[if k % 2 == 0 { LENGTH } else { WIDTH }];
+            let inside_px = INSIDE_MAX * m * extent_mm / self.geometry.mm_per_px;
+            FaceVote {
+                offset_mm: outermost_peak(&votes[k], -inside_px)
+                    .map_or(0.0, |px| px * self.geometry.mm_per_px / m),
+                side_depth_mm: confusing.then_some(mean / m),
+            }
+        })
+    }
+}
+
+/// Offset, px, from `first_px` on, of the outermost place where the signed votes agree, those
+/// above a hidden side and those above a visible one each among themselves; `None` without votes.
+fn outermost_peak(votes: &[[f64; VOTE_BINS]; 2], first_px: f64) -> Option<f64> {
+    // Neighbours within a pixel and a half are the same edge.
+    let smooth = |i: usize| -> f64 {
+        votes.iter().map(|votes| votes[i - 1..=i + 1].iter().sum::<f64>().abs()).sum()
+    };
+    let first = ((first_px - VOTE_FIRST_PX) / VOTE_BIN_PX).ceil().max(1.0) as usize;
+    let inner = || first.min(VOTE_BINS - 1)..VOTE_BINS - 1;
+    let most = inner().map(smooth).fold(0.0, f64::max);
+    let peak = inner().rev().find(|&i| {
+        let here = smooth(i);
+        let below = i + 1 == VOTE_BINS - 1 || smooth(i + 1) <= here;
+        most > 0.0 && here >= VOTE_SHARE * most && below && (i == first || smooth(i - 1) <= here)
+    })?;
+    Some(VOTE_FIRST_PX + (peak as f64 + 0.5) * VOTE_BIN_PX)
+}
