@@ -41,6 +41,8 @@ const NOTHING: u8 = 0;
 /// A parcel in one frame, ready to be met by rays.
 struct Solid {
     parcel: Parcel,
+    /// Of its edges.
+    radius: f32,
     centre: [f32; 2],
     sin: f32,
     cos: f32,
@@ -54,6 +56,22 @@ struct Solid {
 struct Hit {
     surface: u8,
     grey: f32,
+}
+
+/// A ray through a solid; its places are `from + s * along`.
+struct Crossing {
+    from: [f32; 3],
+    along: [f32; 3],
+    enter: f32,
+    leave: f32,
+    /// 0: top; 1, 2: the sides across the length; 3, 4: the others.
+    face: usize,
+}
+
+impl Crossing {
+    fn at(&self, s: f32) -> [f32; 3] {
+        [0, 1, 2].map(|k| self.from[k] + s * self.along[k])
+    }
 }
 
 impl Renderer {
@@ -189,6 +207,7 @@ impl Renderer {
         ];
         (bounds[0] < bounds[1] && bounds[2] < bounds[3]).then_some(Solid {
             parcel: *parcel,
+            radius: self.scenario.edge_radius_mm.min(0.45 * parcel.height_mm) as f32,
             centre: [x_mm as f32, parcel.y_mm as f32],
             sin: sin as f32,
             cos: cos as f32,
@@ -266,8 +285,8 @@ impl Renderer {
             // 7 is coprime to 16: times are spread evenly over every row and column.
             let time = ((k * 7 % (SUB * SUB)) as f32 + 0.5) / (SUB * SUB) as f32 - 0.5;
             sum += solid
-                .meet(self.centre, ground, time * blur_mm)
-                .map_or(behind, |hit| hit.grey * shade);
+                .meet_rounded(self.centre, ground, time * blur_mm)
+                .map_or(behind, |grey| grey * shade);
         }
         sum / (SUB * SUB) as f32
     }
@@ -285,8 +304,9 @@ impl Solid {
         [self.cos * dx + self.sin * dy, self.cos * dy - self.sin * dx]
     }
 
-    /// Where the ray from the camera to `ground` meets the solid moved by `shift_mm`.
-    fn meet(&self, camera: [f32; 3], ground: [f32; 2], shift_mm: f32) -> Option<Hit> {
+    /// The ray from the camera to `ground`, in the axes of the solid moved by `shift_mm`, and the
+    /// part of it that is in the cuboid with sharp edges, from the face it enters by.
+    fn cross(&self, camera: [f32; 3], ground: [f32; 2], shift_mm: f32) -> Option<Crossing> {
         let from = self.local([camera[0] - shift_mm, camera[1]]);
         let to = self.local([ground[0] - shift_mm, ground[1]]);
         // Slab method; s runs from the camera (0) to the belt (1). Source: Kay and Kajiya 1986.
@@ -306,11 +326,70 @@ impl Solid {
             leave = f32::min(leave, far);
         }
         // A ray that misses the belt is NaN, and so is everything met by it.
-        if enter.partial_cmp(&leave) != Some(std::cmp::Ordering::Less) {
-            return None;
+        let hit = enter.partial_cmp(&leave) == Some(std::cmp::Ordering::Less);
+        hit.then_some(Crossing {
+            from: [from[0], from[1], camera[2]],
+            along: [to[0] - from[0], to[1] - from[1], -camera[2]],
+            enter,
+            leave,
+            face,
+        })
+    }
+
+    /// Where a ray meets the solid as if its edges were sharp.
+    fn meet(&self, camera: [f32; 3], ground: [f32; 2], shift_mm: f32) -> Option<Hit> {
+        let ray = self.cross(camera, ground, shift_mm)?;
+        let [a, b, z] = ray.at(ray.enter);
+        Some(if ray.face == 0 { self.top([a, b]) } else { self.side(ray.face, z) })
+    }
+
+    /// Grey level where a ray meets the solid with its rounded edges: sphere tracing (Hart 1996)
+    /// from the sharp cuboid's surface on. Radiance goes from the top's to the side's with
+    /// the cosine of the normal's tilt, as under diffuse light.
+    fn meet_rounded(&self, camera: [f32; 3], ground: [f32; 2], shift_mm: f32) -> Option<f32> {
+        const NEAR_MM: f32 = 0.02;
+        const STEPS: usize = 16;
+        let ray = self.cross(camera, ground, shift_mm)?;
+        if self.radius == 0.0 {
+            return self.meet(camera, ground, shift_mm).map(|hit| hit.grey);
         }
-        let at = [0, 1].map(|k| from[k] + enter * (to[k] - from[k]));
-        Some(if face == 0 { self.top(at) } else { self.side(face, camera[2] * (1.0 - enter)) })
+        let length = ray.along.iter().map(|a| a * a).sum::<f32>().sqrt();
+        let mut s = ray.enter;
+        for _ in 0..STEPS {
+            let p = ray.at(s);
+            // It goes on below the belt, so that its bottom edges are not rounded.
+            let core = [
+                p[0].abs() - (self.half[0] - self.radius),
+                p[1].abs() - (self.half[1] - self.radius),
+                p[2] - (self.height - self.radius),
+            ];
+            let outside = core.map(|c| c.max(0.0));
+            let distance = outside.iter().map(|c| c * c).sum::<f32>().sqrt() - self.radius
+                + core[0].max(core[1]).max(core[2]).min(0.0);
+            if distance < NEAR_MM {
+                return Some(self.shade(p, outside));
+            }
+            s += distance / length;
+            if s > ray.leave {
+                return None;
+            }
+        }
+        None
+    }
+
+    /// Grey level at a point of the surface whose normal has the direction `normal` in the
+    /// octant of the point.
+    fn shade(&self, [a, b, z]: [f32; 3], normal: [f32; 3]) -> f32 {
+        let [x2, y2, z2] = normal.map(|n| n * n);
+        let top = || self.top([a, b]).grey;
+        if x2 + y2 == 0.0 {
+            return top();
+        }
+        let side_x = || self.side(1 + usize::from(a > 0.0), z).grey;
+        let side_y = || self.side(3 + usize::from(b > 0.0), z).grey;
+        let side = (x2 * side_x() + y2 * side_y()) / (x2 + y2);
+        let cosine = (z2 / (x2 + y2 + z2)).sqrt();
+        if cosine == 0.0 { side } else { side + cosine * (top() - side) }
     }
 
     /// Top face: plain, tape along the middle, label with bars.

@@ -17,6 +17,9 @@ pub struct Scenario {
     pub frames: u64,
     /// Shutter time.
     pub exposure_ms: f64,
+    /// Radius of the parcels' edges.
+    #[serde(default = "edge_radius_mm")]
+    pub edge_radius_mm: f64,
     /// Lens, image size and pose, as in camera.toml.
     camera: CameraFile,
     /// The belt.
@@ -32,6 +35,11 @@ pub struct Scenario {
     parcels: Vec<Parcel>,
     /// Parcels drawn at random, after those.
     random: Option<RandomTable>,
+}
+
+/// A carton's.
+fn edge_radius_mm() -> f64 {
+    1.2
 }
 
 /// `[belt]`
