@@ -73,7 +73,8 @@ fn parcels(random: &mut Random) -> String {
     let log =
         |random: &mut Random, [low, high]: [f64; 2]| (random.between([low.ln(), high.ln()])).exp();
     let mut text = String::new();
-    let mut end_mm = -ZONE_HALF_MM[0] - 400.0;
+    // Out of sight while the empty belt is learned.
+    let mut end_mm = -ZONE_HALF_MM[0] - 800.0;
     for _ in 0..PARCELS_PER_BELT {
         let (a, b) = (log(random, [20.0, 600.0]), log(random, [20.0, 600.0]));
         let (l, w) = (a.max(b), a.min(b));

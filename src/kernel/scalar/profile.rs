@@ -5,6 +5,11 @@ use crate::image::Plane;
 /// A step is no wider than twice this many samples.
 const RAMP: usize = 4;
 
+/// Blur of a step as the slope sees it, samples, one sigma: optics, pixel, map and smoothing.
+const BLUR: f32 = 1.2;
+/// A step is not drawn further than this, samples.
+const DRAWN_MAX: f32 = 1.2;
+
 /// A step found on a profile.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
 pub struct Step {
@@ -46,6 +51,8 @@ pub fn sample(
 /// The slope is the difference of neighbours smoothed by [1 2 1]; its extremum is refined by
 /// a parabola, which is unbiased for a symmetric blur. A ramp is no step: of a slope counts
 /// what exceeds that on both sides, [`RAMP`] samples away; shadows have wide borders.
+/// A ramp that begins at the step, as a contact shadow does, draws the extremum to its side: with a
+/// step of height A blurred to sigma, and slopes B beside it, by `sigma^2 (B+ - B-) / A`.
 pub fn steps(profile: &[f32], slope_min: f32, steps: &mut [Step]) -> usize {
     let slope = |i: usize| {
         let p = &profile[i - 2..=i + 2];
@@ -64,7 +71,23 @@ pub fn steps(profile: &[f32], slope_min: f32, steps: &mut [Step]) -> usize {
         }
         let curvature = before - 2.0 * here + after;
         let offset = if curvature == 0.0 { 0.0 } else { 0.5 * (before - after) / curvature };
-        let step = Step { at: i as f32 + offset.clamp(-0.5, 0.5), slope: sharp * sign };
+        let offset = offset.clamp(-0.5, 0.5);
+        // What the slopes beside the step would be at it, from those beyond its blur.
+        let beside = [-1i32, 1].map(|side| {
+            // Between the samples, as far from the step on either side.
+            let at = |d: i32| {
+                let x = i as f32 + offset + (side * d) as f32;
+                let inside = x >= 2.0 && x + 1.0 < last as f32;
+                let lerp = |j: usize| slope(j) + (x - j as f32) * (slope(j + 1) - slope(j));
+                inside.then(|| lerp(x as usize) * sign)
+            };
+            let [Some(near), Some(far)] = [at(3), at(5)] else { return 0.0 };
+            (2.5 * near - 1.5 * far).clamp(0.0, 2.0 * near.max(0.0))
+        });
+        let rise = here * sign - 0.5 * (beside[0] + beside[1]);
+        let drawn = BLUR * (beside[1] - beside[0]) / (2.507 * rise.max(0.2 * here.abs()));
+        let at = i as f32 + offset - drawn.clamp(-DRAWN_MAX, DRAWN_MAX);
+        let step = Step { at, slope: sharp * sign };
         let rank = steps[..count].iter().position(|s| s.slope.abs() < sharp).unwrap_or(count);
         if rank < steps.len() {
             count = (count + 1).min(steps.len());
@@ -111,6 +134,29 @@ mod tests {
         let edge_in_it: Vec<f32> =
             ramp.iter().zip(blurred_step(15.0, 0.0, 12.0)).map(|(a, b)| a + b).collect();
         assert_eq!(steps(&edge_in_it, 0.8, &mut [Step::default(); 3]), 1);
+    }
+
+    #[test]
+    fn a_contact_shadow_draws_no_step_to_its_side() {
+        // A dark top, 7 grey levels of step, and a shadow that fades over 8 samples.
+        let profile: Vec<f32> = (0..250)
+            .map(|i| {
+                let x = (i as f32 - 125.0) / 10.0;
+                let near = (1.0 - x / 8.0).clamp(0.0, 1.0);
+                if x < 0.0 { 20.0 } else { 45.0 - 18.0 * near * near }
+            })
+            .collect();
+        // A pixel and the optics: two boxes, one and one and a half samples wide.
+        let box_filter = |p: &[f32], n: usize| -> Vec<f32> {
+            p.windows(n).map(|w| w.iter().sum::<f32>() / n as f32).collect()
+        };
+        let blurred = box_filter(&box_filter(&profile, 10), 15);
+        let sampled: Vec<f32> = blurred.iter().step_by(10).copied().collect();
+        let mut found = [Step::default(); 1];
+        assert_eq!(steps(&sampled, 0.8, &mut found), 1);
+        // Windows of 10 and 15 fine samples shift by 11.5 of them.
+        let truth = (125.0 - 11.5) / 10.0;
+        assert!((found[0].at - truth).abs() < 0.4, "{} {truth}", found[0].at);
     }
 
     #[test]

@@ -39,6 +39,8 @@ const SHADOW_TRUST: f64 = 0.2;
 /// Light comes from above: a visible side is rarely brighter than the top, and a rising step
 /// there is rather that from a dark side to the belt.
 const RISING_TRUST: f64 = 0.5;
+/// Steeper than this, grey levels a px, is no better: a label must not outdo a dark edge.
+const SLOPE_ENOUGH: f32 = 4.0;
 /// A mean square silhouette residual that costs half of a fit's contrast. Shadows alone make 10
 /// of it.
 const REACH_ERROR_HALVES: f64 = 50.0;
@@ -456,7 +458,7 @@ impl Problem<'_> {
                 used.polarity[e][usize::from(facing)] += f64::from(slope.signum());
                 let share = residual / gate_mm;
                 let biweight = (1.0 - share * share).powi(2);
-                used.contrast += biweight * f64::from(slope.abs()).ln_1p();
+                used.contrast += biweight * f64::from(slope.abs().min(SLOPE_ENOUGH)).ln_1p();
                 let trust = trust[e][usize::from(slope > 0.0)];
                 normal.add(
                     residual,
@@ -527,7 +529,7 @@ fn choose(
             continue;
         }
         let sign = if step.slope > 0.0 { rising } else { 1.0 };
-        let score = f64::from(step.slope.abs()) * near * sign;
+        let score = f64::from(step.slope.abs().min(SLOPE_ENOUGH)) * near * sign;
         if best.is_none_or(|(s, _, _)| score > s) {
             best = Some((score, residual, step.slope));
         }
