@@ -24,8 +24,9 @@ const INSIDE: f64 = 0.1;
 const EIGENVALUE_MIN: f32 = 10.0;
 /// A corner that leaves its row by this much is a reflection or something else, px.
 const ROW_MAX_PX: f32 = 0.7;
-/// Over less travel a corner's own line does not predict its place, mm.
-const OWN_LINE_MM: f64 = 60.0;
+/// A corner whose places are further from a straight line than this (root mean square, px) jumped,
+/// from one bar of a code to the next.
+const STRAIGHT_MAX_PX: f64 = 0.5;
 /// A corner tells the height once it was followed over this share of the zone, ...
 const TRAVEL_MIN: f64 = 0.25;
 /// ... in this many views.
@@ -43,11 +44,12 @@ pub struct Corner {
     patch: Patch,
     start_px: [f32; 2],
     start_travel_mm: f64,
-    /// Views it was found in, and the sums of its straight line: t, x, tt, tx.
+    /// Views it was found in, and the sums of its straight line: t, x, tt, tx, xx.
     views: u32,
-    sums: [f64; 4],
+    sums: [f64; 5],
     followed: bool,
-    travel_mm: f64,
+    /// Travel and place in the last view.
+    last_mm: [f64; 2],
 }
 
 impl Corner {
@@ -57,9 +59,9 @@ impl Corner {
         start_px: [0.0; 2],
         start_travel_mm: 0.0,
         views: 0,
-        sums: [0.0; 4],
+        sums: [0.0; 5],
         followed: false,
-        travel_mm: 0.0,
+        last_mm: [0.0; 2],
     };
 
     fn begin(patch: Patch, px: [usize; 2], travel_mm: f64) -> Self {
@@ -74,22 +76,24 @@ impl Corner {
         }
     }
 
-    fn slope(&self) -> f64 {
-        let n = f64::from(self.views);
-        let [t, x, tt, tx] = self.sums;
-        (n * tx - t * x) / (n * tt - t * t)
-    }
-
     /// Image travel over belt travel, once it is known.
-    fn ratio(&self, zone_length_mm: f64) -> Option<f64> {
-        let seen = self.views >= VIEWS_MIN && self.travel_mm >= TRAVEL_MIN * zone_length_mm;
-        seen.then(|| self.slope()).filter(|r| r.is_finite())
+    fn ratio(&self, zone_length_mm: f64, mm_per_px: f64) -> Option<f64> {
+        if self.views < VIEWS_MIN || self.last_mm[0] < TRAVEL_MIN * zone_length_mm {
+            return None;
+        }
+        let n = f64::from(self.views);
+        let [t, x, tt, tx, xx] = self.sums.map(|sum| sum / n);
+        let slope = (tx - t * x) / (tt - t * t);
+        let mean_square = (xx - x * x) - slope * (tx - t * x);
+        let straight = mean_square < (STRAIGHT_MAX_PX * mm_per_px).powi(2);
+        // Nothing lies below the belt.
+        (straight && slope > 1.0 - AGREE).then_some(slope)
     }
 
     fn follow(&mut self, view: &BeltView, grey: Plane<'_>, travel_mm: f64, ratio: f64) {
         let t_mm = travel_mm - self.start_travel_mm;
-        let ratio = if self.travel_mm > OWN_LINE_MM { self.slope() } else { ratio };
-        let near = [self.start_px[0] + (ratio * t_mm / view.mm_per_px) as f32, self.start_px[1]];
+        let x_mm = self.last_mm[1] + ratio * (t_mm - self.last_mm[0]);
+        let near = [self.start_px[0] + (x_mm / view.mm_per_px) as f32, self.start_px[1]];
         let found = self.patch.find(grey, near);
         let Some([u, _]) = found.filter(|at| (at[1] - near[1]).abs() <= ROW_MAX_PX) else {
             self.followed = false;
@@ -97,8 +101,9 @@ impl Corner {
         };
         let x_mm = f64::from(u - self.start_px[0]) * view.mm_per_px;
         self.views += 1;
-        self.travel_mm = t_mm;
-        for (sum, more) in self.sums.iter_mut().zip([t_mm, x_mm, t_mm * t_mm, t_mm * x_mm]) {
+        self.last_mm = [t_mm, x_mm];
+        let more = [t_mm, x_mm, t_mm * t_mm, t_mm * x_mm, x_mm * x_mm];
+        for (sum, more) in self.sums.iter_mut().zip(more) {
             *sum += more;
         }
     }
@@ -169,9 +174,9 @@ fn pixel(view: &BeltView, at: Vector2<f64>) -> Option<[usize; 2]> {
 }
 
 /// The motion that most corners share; `None` when too few agree.
-pub fn top_motion(corners: &[Corner], zone_length_mm: f64) -> Option<TopMotion> {
-    let mut ratios: heapless::Vec<f64, CORNERS> =
-        corners.iter().take(CORNERS).filter_map(|c| c.ratio(zone_length_mm)).collect();
+pub fn top_motion(corners: &[Corner], zone_length_mm: f64, mm_per_px: f64) -> Option<TopMotion> {
+    let told = corners.iter().take(CORNERS).filter_map(|c| c.ratio(zone_length_mm, mm_per_px));
+    let mut ratios: heapless::Vec<f64, CORNERS> = told.collect();
     ratios.sort_unstable_by(f64::total_cmp);
     let agreeing = |ratio: f64| ratios.iter().filter(move |r| (**r - ratio).abs() <= AGREE);
     // Of equal crowds the higher one: what is below the top face is on a side or a lid's flap.

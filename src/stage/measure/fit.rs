@@ -216,7 +216,8 @@ impl Problem<'_> {
     /// cuboid that explains more contrast is kept.
     pub fn fit_edges(&self, views: &[PassView], start: Params) -> Option<Estimate> {
         let found = self.face_votes(views, &start);
-        let mut best: Option<Estimate> = None;
+        // Without shadows the silhouette itself is near enough.
+        let mut best = self.refine_edges(views, start);
         for as_base in 0..16u8 {
             let takes = |k: usize| as_base >> k & 1 == 1;
             if (0..4).any(|k| takes(k) && found[k].side_depth_mm.is_none()) {

@@ -25,6 +25,7 @@ use crate::plan::{Block, Memory, Plan};
 use crate::units::BeltRect;
 use corners::{CORNERS, Corner, top_motion};
 use fit::{Problem, Silhouette, canonical_estimate};
+use model::named_like;
 use observe::PassView;
 
 /// A first estimate needs this many views ...
@@ -234,7 +235,11 @@ impl Measure {
             travel_sigma: pass.last.sigma_since(&pass.first),
             silhouette,
             enclosing: false,
-            top_motion: top_motion(self.corners(slot), self.zone.length_mm()),
+            top_motion: top_motion(
+                self.corners(slot),
+                self.zone.length_mm(),
+                self.geometry.mm_per_px,
+            ),
         }
     }
 
@@ -253,7 +258,9 @@ impl Measure {
     pub fn finish(&self, slot: usize, at: BeltPosition) -> Option<Measured> {
         let cuboid = self.best(slot, |problem, views| {
             let reach = problem.fit_reach(views, None)?;
-            let edges = problem.fit_edges(views, reach.params);
+            // Profiles were taken across the faces of the running estimate.
+            let running = self.passes[slot].estimate.map_or(reach.params, |e| e.params);
+            let edges = problem.fit_edges(views, named_like(reach.params, &running));
             edges.filter(|e| e.edge_count >= EDGE_COUNT_MIN).or(Some(reach))
         });
         let mut result = match cuboid {

@@ -190,6 +190,17 @@ impl Outline {
     }
 }
 
+/// The same cuboid, its axes named as those of `other`: faces keep their identity.
+pub fn named_like(mut params: Params, other: &Params) -> Params {
+    use std::f64::consts::FRAC_PI_2;
+    let quarters = ((other[YAW] - params[YAW]) / FRAC_PI_2).round();
+    params[YAW] += quarters * FRAC_PI_2;
+    if quarters.rem_euclid(2.0) == 1.0 {
+        params.swap_rows(LENGTH, WIDTH);
+    }
+    params
+}
+
 /// With length >= width and yaw in (-90, 90] degrees; the same cuboid.
 pub fn canonical(mut params: Params) -> Params {
     use std::f64::consts::{FRAC_PI_2, PI};
@@ -275,6 +286,21 @@ mod tests {
         let outline =
             Outline::new(&view(), &Params::from([12.0, -7.0, 0.3, 50.0, 50.0, 40.0, 1.0]), 0.0);
         assert_eq!(outline.side_visible, [false; 4]);
+    }
+
+    #[test]
+    fn axes_named_like_another_s_keep_the_cuboid() {
+        let params = Params::from([0.0, 0.0, -0.1, 440.0, 118.0, 5.0, 1.0]);
+        for yaw in [-0.1, 1.48, 3.0, -1.6, 7.9, 20.3] {
+            let mut other = params;
+            other[YAW] = yaw;
+            let named = named_like(params, &other);
+            assert!((named[YAW] - yaw).abs() <= std::f64::consts::FRAC_PI_4 + 1e-12);
+            let [before, after] = [params, named].map(|p| Outline::new(&view(), &p, 0.0));
+            for v in &before.top {
+                assert!(after.top.iter().any(|o| (o.image - v.image).norm() < 1e-9));
+            }
+        }
     }
 
     #[test]
