@@ -6,9 +6,9 @@ use crate::image::Plane;
 const RAMP: usize = 4;
 
 /// Blur of a step as the slope sees it, samples, one sigma: optics, pixel, map and smoothing.
-const BLUR: f32 = 1.2;
+const BLUR: f32 = 1.4;
 /// A step is not drawn further than this, samples.
-const DRAWN_MAX: f32 = 1.2;
+const DRAWN_MAX: f32 = 1.6;
 
 /// A step found on a profile.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
