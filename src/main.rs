@@ -5,6 +5,7 @@ use beltgauge::camera::chessboard::Chessboard;
 use beltgauge::config::Site;
 use beltgauge::error::{Error, Result};
 use beltgauge::event::ParcelRecord;
+use beltgauge::run::budget::{self, StraightDown};
 use beltgauge::run::calibrate::{self, DataSheet};
 use beltgauge::run::demo;
 use beltgauge::run::offline::{self, Observer, Outputs};
@@ -60,12 +61,42 @@ enum Command {
     /// Calibrate the camera: first its lens, then its place over the belt.
     #[command(subcommand)]
     Calibrate(Calibrate),
+    /// What a geometry can measure: expected standard deviations, before anything is bought.
+    Budget(Budget),
     /// Validate a configuration and print the memory plan.
     Check {
         /// Configuration file.
         #[arg(long, default_value = "/etc/beltgauge/beltgauge.toml")]
         config: PathBuf,
     },
+}
+
+#[derive(clap::Args)]
+struct Budget {
+    /// Configuration file, instead of the options for a camera that looks straight down.
+    #[arg(long, conflicts_with_all = ["camera_height_mm", "focal_px", "image", "zone_mm", "speed_mm_per_s"])]
+    config: Option<PathBuf>,
+    /// Lens over the belt.
+    #[arg(long, value_parser = positive, required_unless_present = "config")]
+    camera_height_mm: Option<f64>,
+    /// Focal length in pixels: that in mm over the size of a pixel.
+    #[arg(long, value_parser = positive, required_unless_present = "config")]
+    focal_px: Option<f64>,
+    /// Columns and rows, as 1920x1200.
+    #[arg(long, value_parser = sides, required_unless_present = "config")]
+    image: Option<[usize; 2]>,
+    /// Measuring zone along and across the belt, as 1200x760.
+    #[arg(long, value_parser = sides, required_unless_present = "config")]
+    zone_mm: Option<[usize; 2]>,
+    /// Belt speed.
+    #[arg(long, value_parser = positive, required_unless_present = "config")]
+    speed_mm_per_s: Option<f64>,
+    /// Frames a second.
+    #[arg(long, value_parser = positive)]
+    fps: f64,
+    /// Write table and plot to this HTML file.
+    #[arg(long)]
+    out: Option<PathBuf>,
 }
 
 #[derive(Subcommand)]
@@ -147,10 +178,20 @@ fn board_size(text: &str) -> std::result::Result<[usize; 2], String> {
     }
 }
 
+fn sides(text: &str) -> std::result::Result<[usize; 2], String> {
+    let sides = text.split_once(['x', 'X']).map(|(a, b)| [a.trim().parse(), b.trim().parse()]);
+    match sides {
+        Some([Ok(a), Ok(b)]) if (16..=20_000).contains(&a) && (16..=20_000).contains(&b) => {
+            Ok([a, b])
+        }
+        _ => Err("give both sides, 16 to 20000, as 1920x1200".to_owned()),
+    }
+}
+
 fn positive(text: &str) -> std::result::Result<f64, String> {
     match text.parse::<f64>() {
         Ok(value) if value > 0.0 && value <= 10_000.0 => Ok(value),
-        _ => Err("give a number of mm above 0, at most 10000".to_owned()),
+        _ => Err("give a number above 0, at most 10000".to_owned()),
     }
 }
 
@@ -214,6 +255,7 @@ fn dispatch(command: Command) -> Result<()> {
             print(format_args!("{counters}"))
         }
         Command::Calibrate(what) => calibrate(what),
+        Command::Budget(what) => print_budget(&what),
         Command::Check { config } => {
             let site = Site::load(&config)?;
             let plan = run::plan(&site);
@@ -222,6 +264,29 @@ fn dispatch(command: Command) -> Result<()> {
             print(format_args!("the configuration is valid"))
         }
     }
+}
+
+fn print_budget(what: &Budget) -> Result<()> {
+    let site = match what {
+        Budget { config: Some(config), .. } => Site::load(config)?,
+        Budget {
+            camera_height_mm: Some(camera_height_mm),
+            focal_px: Some(focal_px),
+            image: Some(image_size_px),
+            zone_mm: Some(zone_mm),
+            speed_mm_per_s: Some(speed_mm_per_s),
+            ..
+        } => StraightDown {
+            camera_height_mm: *camera_height_mm,
+            focal_px: *focal_px,
+            image_size_px: *image_size_px,
+            zone_mm: zone_mm.map(|n| n as f64),
+            speed_mm_per_s: *speed_mm_per_s,
+        }
+        .site()?,
+        _ => return Err(Error::configuration("give --config or all options of the geometry")),
+    };
+    print(format_args!("{}", budget::run(&site, what.fps, what.out.as_deref())?))
 }
 
 fn calibrate(what: Calibrate) -> Result<()> {

@@ -12,9 +12,8 @@ use opencv::core::{self, Mat, Point, Point2d, Point2f, Size, Size2f, TermCriteri
 use opencv::{Result, calib3d, imgproc, prelude::*, video};
 use serde_json::Value;
 use std::collections::BTreeMap;
-use std::io::Read;
 use std::path::Path;
-use std::process::{Child, Command, Stdio};
+use std::process::{Command, Stdio};
 
 const OBJECTS: [&str; 4] = ["A", "B", "C", "D"];
 /// The one of them whose size the techniques know. The thesis names none for technique 1; for
@@ -22,14 +21,10 @@ const OBJECTS: [&str; 4] = ["A", "B", "C", "D"];
 const REFERENCE: usize = 0;
 /// Errors of technique 1 and 2 that the thesis reports, percent.
 const PUBLISHED: [[f64; 4]; 2] = [[20.0, 13.0, 9.6, 16.0], [10.0, 16.0, 6.5, f64::NAN]];
-/// The two views of a pair are so many frames apart.
-const APART: usize = 3;
 /// Of a corner, relative to the best; the thesis found one "after several simulations".
 const MIN_QUALITIES: [f64; 5] = [0.05, 0.01, 0.005, 0.002, 0.001];
 /// How far an epipolar inlier may be from its line.
 const EPIPOLAR_PX: f64 = 1.0;
-/// Smaller blobs are noise.
-const MIN_BLOB_PX: f64 = 1000.0;
 
 /// Length, width and height; NaN where a technique finds nothing.
 type Dimensions = [f64; 3];
@@ -65,12 +60,12 @@ impl Truth {
         Vector3::new(number(&at[0]) + travel_mm, number(&at[1]), size_mm(self.parcel(id))[2])
     }
 
-    /// The two frames around the moment when a parcel is under the camera.
+    /// Two frames, three apart, around the moment when a parcel is under the camera.
     fn pair(&self, id: &str) -> [usize; 2] {
         let off_mm = |f: usize| self.top_mm(id, f).x.abs();
         let frames = 0..number(&self.0["n_frames"]) as usize;
         let under = frames.min_by(|&a, &b| off_mm(a).total_cmp(&off_mm(b))).expect("frames");
-        [under - 1, under - 1 + APART]
+        [under - 1, under + 2]
     }
 }
 
@@ -89,10 +84,12 @@ fn sides(size: Size2f) -> [f64; 2] {
     [size.width.max(size.height).into(), size.width.min(size.height).into()]
 }
 
-fn decode(video: &Path, to: &[&str]) -> Child {
+/// A decoder that writes grey frames to its output.
+fn decoder(video: &Path, how: &[&str]) -> Command {
     let mut ffmpeg = Command::new("ffmpeg");
-    ffmpeg.args(["-v", "error", "-i"]).arg(video).args(["-pix_fmt", "gray"]).args(to).arg("-");
-    ffmpeg.stdout(Stdio::piped()).spawn().expect("ffmpeg is installed")
+    ffmpeg.args(["-v", "error", "-i"]).arg(video).args(["-pix_fmt", "gray"]).args(how).arg("-");
+    ffmpeg.stdout(Stdio::piped());
+    ffmpeg
 }
 
 /// An undistorted frame and the outlines of what moves in it.
@@ -108,8 +105,8 @@ impl View {
         let place_mm = truth.matrix("R_world_to_camera") * truth.top_mm(id, frame) + shift_mm;
         let at = truth.matrix("camera_matrix") * place_mm / place_mm.z;
         let at = Point2f::new(at.x as f32, at.y as f32);
-        let inside = |b: Vector<Point>| imgproc::point_polygon_test(&b, at, false);
-        self.blobs.iter().position(|b| inside(b).is_ok_and(|side| side > 0.0))
+        let side = |b: Vector<Point>| imgproc::point_polygon_test(&b, at, false);
+        self.blobs.iter().position(|b| side(b).is_ok_and(|side| side > 0.0))
     }
 
     /// Blobs and their edges.
@@ -127,24 +124,22 @@ impl View {
 fn views(video: &Path, truth: &Truth, wanted: &[usize]) -> Result<BTreeMap<usize, View>> {
     let [width, height] = [0, 1].map(|i| number(&truth.0["image_size"][i]) as i32);
     let empty = number(&truth.0["n_empty_frames_at_start"]) as usize;
-    let end = wanted.iter().max().map_or(0, |last| last + 1);
-    let mut ffmpeg = decode(video, &["-frames:v", &end.to_string(), "-f", "rawvideo"]);
-    let mut pipe = ffmpeg.stdout.take().expect("piped");
+    let numbers: Vec<usize> = (0..empty).chain(wanted.iter().copied()).collect();
+    let picks: Vec<String> = numbers.iter().map(|n| format!("eq(n,{n})")).collect();
+    let pick = format!("select='{}'", picks.join("+"));
+    let how = ["-vf", &pick, "-fps_mode", "passthrough", "-f", "rawvideo"];
+    let decoded = decoder(video, &how).output().expect("ffmpeg is installed").stdout;
+    assert_eq!(decoded.len(), numbers.len() * (width * height) as usize, "frames are missing");
     let camera = mat(&truth.matrix("camera_matrix"))?;
     let coefficient = |i: usize| number(&truth.0["dist_coeffs_k1_k2_p1_p2_k3"][i]);
     let lens: Vector<f64> = (0..5).map(coefficient).collect();
     let mut background = video::create_background_subtractor_mog2_def()?;
-    let mut pixels = vec![0u8; (width * height) as usize];
     let mut views = BTreeMap::new();
-    for frame in 0..end {
-        pipe.read_exact(&mut pixels).expect("a whole frame");
-        if frame >= empty && !wanted.contains(&frame) {
-            continue;
-        }
-        let raw = Mat::new_rows_cols_with_data(height, width, &pixels)?;
+    for (frame, pixels) in numbers.iter().zip(decoded.chunks((width * height) as usize)) {
+        let raw = Mat::new_rows_cols_with_data(height, width, pixels)?;
         let (mut image, mut a, mut b) = (Mat::default(), Mat::default(), Mat::default());
         calib3d::undistort_def(&raw, &mut image, &camera, &lens)?;
-        let rate = if frame < empty { -1.0 } else { 0.0 };
+        let rate = if *frame < empty { -1.0 } else { 0.0 };
         BackgroundSubtractorMOG2Trait::apply(&mut background, &image, &mut a, rate)?;
         imgproc::threshold(&a, &mut b, 200.0, 255.0, imgproc::THRESH_BINARY)?;
         imgproc::morphology_ex_def(&b, &mut a, imgproc::MORPH_OPEN, &square(5)?)?;
@@ -152,39 +147,27 @@ fn views(video: &Path, truth: &Truth, wanted: &[usize]) -> Result<BTreeMap<usize
         let mut all = Vector::<Vector<Point>>::new();
         let (outer, simple) = (imgproc::RETR_EXTERNAL, imgproc::CHAIN_APPROX_SIMPLE);
         imgproc::find_contours_def(&b, &mut all, outer, simple)?;
-        let area_px = |b: &Vector<Point>| imgproc::contour_area_def(b).unwrap_or(0.0);
-        let blobs = all.iter().filter(|b| area_px(b) > MIN_BLOB_PX).collect();
-        views.insert(frame, View { image, blobs });
+        let noise = |b: &Vector<Point>| imgproc::contour_area_def(b).is_ok_and(|px| px < 1000.0);
+        let blobs = all.iter().filter(|b| !noise(b)).collect();
+        views.insert(*frame, View { image, blobs });
     }
-    assert!(ffmpeg.wait().expect("ends").success());
     Ok(views)
 }
 
 /// Minimum eigenvalue corners under a mask, tracked by pyramidal Lucas-Kanade. Chosen in the
 /// techniques' favour: tracks must lead back to where they began, and away from there.
-fn tracks([first, second]: [&View; 2], mask: &Mat, min_quality: f64) -> Result<Tracks> {
-    let (first, second) = (&first.image, &second.image);
+fn tracks([p, q]: [&View; 2], mask: &Mat, min_quality: f64) -> Result<Tracks> {
+    let (p, q, mut tracks) = (&p.image, &q.image, Tracks::default());
     let mut from = Vector::<Point2f>::new();
-    imgproc::good_features_to_track(
-        first,
-        &mut from,
-        4000,
-        min_quality,
-        5.0,
-        mask,
-        3,
-        false,
-        0.04,
-    )?;
+    imgproc::good_features_to_track(p, &mut from, 4000, min_quality, 5.0, mask, 3, false, 0.04)?;
+    if from.is_empty() {
+        return Ok(tracks);
+    }
     let (mut to, mut back) = (Vector::<Point2f>::new(), Vector::<Point2f>::new());
     let (mut there, mut again) = (Vector::<u8>::new(), Vector::<u8>::new());
     let mut errors = Vector::<f32>::new();
-    if !from.is_empty() {
-        let (p, q) = (first, second);
-        video::calc_optical_flow_pyr_lk_def(p, q, &from, &mut to, &mut there, &mut errors)?;
-        video::calc_optical_flow_pyr_lk_def(q, p, &to, &mut back, &mut again, &mut errors)?;
-    }
-    let mut tracks = Tracks::default();
+    video::calc_optical_flow_pyr_lk_def(p, q, &from, &mut to, &mut there, &mut errors)?;
+    video::calc_optical_flow_pyr_lk_def(q, p, &to, &mut back, &mut again, &mut errors)?;
     for (i, a) in from.iter().enumerate() {
         let (b, c) = (to.get(i)?, back.get(i)?);
         let followed = there.get(i)? != 0 && again.get(i)? != 0;
@@ -207,15 +190,11 @@ impl Pose {
     /// Fundamental matrix, essential matrix, decomposition; `None` when they fail or when more
     /// than a tenth of the points comes to lie behind a camera.
     fn of(camera: &Matrix3<f64>, [a, b]: &Tracks) -> Result<Option<Self>> {
-        if a.len() < 8 {
-            return Ok(None);
-        }
         let (mut inliers, ransac) = (Vector::<u8>::new(), calib3d::FM_RANSAC);
-        let found =
-            calib3d::find_fundamental_mat_mask(a, b, &mut inliers, ransac, EPIPOLAR_PX, 0.99)?;
-        if found.rows() != 3 {
-            return Ok(None);
-        }
+        let found = (a.len() > 7).then(|| {
+            calib3d::find_fundamental_mat_mask(a, b, &mut inliers, ransac, EPIPOLAR_PX, 0.99)
+        });
+        let Some(found) = found.transpose()?.filter(|f| f.rows() == 3) else { return Ok(None) };
         let all = inliers.iter().filter(|&inlier| inlier != 0).count();
         let fundamental = Matrix3::from_row_slice(found.data_typed()?);
         let (e, k) = (mat(&(camera.transpose() * fundamental * camera))?, mat(camera)?);
@@ -232,38 +211,25 @@ impl Pose {
     /// The pose for all frames. The thesis takes one pair and tunes until the result is
     /// consistent; here all are tried and, as a belt does not turn, the smallest turn wins.
     fn of_belt(truth: &Truth, views: &BTreeMap<usize, View>) -> Result<Self> {
-        let mut best: Option<Self> = None;
+        let mut found = Vec::new();
         for pair in OBJECTS.map(|id| truth.pair(id).map(|f| &views[&f])) {
             for min_quality in MIN_QUALITIES {
                 let tracks = tracks(pair, &pair[0].mask(&pair[0].blobs)?, min_quality)?;
-                let found = Self::of(&truth.matrix("camera_matrix"), &tracks)?;
-                let least_deg = best.as_ref().map_or(f64::INFINITY, |b| b.turn_deg);
-                best = found.filter(|p| p.turn_deg < least_deg).or(best);
+                found.extend(Self::of(&truth.matrix("camera_matrix"), &tracks)?);
             }
         }
-        Ok(best.expect("a pose from one of the pairs"))
+        let least = found.into_iter().min_by(|a, b| a.turn_deg.total_cmp(&b.turn_deg));
+        Ok(least.expect("a pose from one of the pairs"))
     }
 
-    /// Places of the tracks that are epipolar inliers.
     fn triangulated(&self, [a, b]: &Tracks) -> Result<Vec<Vector3<f64>>> {
-        let mut found = Mat::default();
-        if !a.is_empty() {
-            calib3d::triangulate_points(
-                &self.projections[0],
-                &self.projections[1],
-                a,
-                b,
-                &mut found,
-            )?;
+        let (n, [p, q], mut found) = (a.len(), &self.projections, Mat::default());
+        if n > 0 {
+            calib3d::triangulate_points(p, q, a, b, &mut found)?;
         }
-        let (n, all) = (a.len(), found.data_typed::<f64>()?);
-        let near = |(a, b): (Point2d, Point2d)| {
-            let line = self.fundamental * Vector3::new(a.x, a.y, 1.0);
-            line.dot(&Vector3::new(b.x, b.y, 1.0)).abs() < EPIPOLAR_PX * line.xy().norm()
-        };
-        let inliers = a.iter().zip(b).enumerate().filter(|(_, track)| near(*track));
+        let all = found.data_typed::<f64>()?;
         let place = |i| Vector3::from_fn(|k, _| all[k * n + i] / all[3 * n + i]);
-        Ok(inliers.map(|(i, _)| place(i)).collect())
+        Ok((0..n).map(place).collect())
     }
 
     /// Technique 1, unscaled: the sides of the blob's smallest rectangle, and the distance of
@@ -272,8 +238,8 @@ impl Pose {
         let (a, b) = (imgproc::min_area_rect(a)?, imgproc::min_area_rect(b)?);
         let centre = |c: Point2f| Vector::from_iter([Point2d::new(c.x.into(), c.y.into())]);
         let [length, width] = sides(a.size);
-        let place = self.triangulated(&[centre(a.center), centre(b.center)])?;
-        Ok(place.first().map_or(NOTHING, |place| [length, width, place.norm()]))
+        let places = self.triangulated(&[centre(a.center), centre(b.center)])?;
+        Ok([length, width, places[0].norm()])
     }
 
     /// Technique 2, unscaled: the smallest cuboid, upright as the camera looks straight down,
@@ -284,9 +250,15 @@ impl Pose {
         let min_quality = MIN_QUALITIES[MIN_QUALITIES.len() - 1];
         for (i, blob) in pair[0].blobs.iter().enumerate() {
             let mask = pair[0].mask(&Vector::from_iter([blob]))?;
-            for place in self.triangulated(&tracks(pair, &mask, min_quality)?)? {
-                cloud.push(place.cast::<f32>().into());
-                labels.push([i as i32]);
+            let tracks = tracks(pair, &mask, min_quality)?;
+            for (track, place) in self.triangulated(&tracks)?.iter().enumerate() {
+                let [a, b] = [tracks[0].get(track)?, tracks[1].get(track)?];
+                let line = self.fundamental * Vector3::new(a.x, a.y, 1.0);
+                let off = line.dot(&Vector3::new(b.x, b.y, 1.0)) / line.xy().norm();
+                if off.abs() < EPIPOLAR_PX {
+                    cloud.push(place.cast::<f32>().into());
+                    labels.push([i as i32]);
+                }
             }
         }
         let (k, flags) = (pair[0].blobs.len() as i32, core::KMEANS_USE_INITIAL_LABELS);
@@ -309,7 +281,9 @@ impl Pose {
 
 /// Both techniques, scaled with the reference.
 fn laboratory(video: &Path, truth: &Truth) -> Result<[[Dimensions; 4]; 2]> {
-    let wanted: Vec<usize> = OBJECTS.iter().flat_map(|id| truth.pair(id)).collect();
+    let mut wanted = OBJECTS.map(|id| truth.pair(id)).concat();
+    wanted.sort_unstable();
+    wanted.dedup();
     let views = views(video, truth, &wanted)?;
     let pose = Pose::of_belt(truth, &views)?;
     let (mut rectangles, mut cuboids) = ([NOTHING; 4], [NOTHING; 4]);
@@ -339,17 +313,13 @@ fn product(video: &Path, truth: &Truth) -> [Dimensions; 4] {
     let folder = Path::new(env!("CARGO_TARGET_TMPDIR")).join("lab_baseline");
     std::fs::create_dir_all(&folder).expect("writable");
     let (t, k) = (&truth.0, &truth.0["camera_matrix"]);
+    let [fx, fy, cx, cy] = [&k[0][0], &k[1][1], &k[0][2], &k[1][2]];
+    let [size, lens] = ["image_size", "dist_coeffs_k1_k2_p1_p2_k3"].map(|key| &t[key]);
+    let [turn, shift] = ["R_world_to_camera", "t_world_to_camera_mm"].map(|key| &t[key]);
     let camera = format!(
-        "image_size_px = {}\n[lens]\nmodel = \"brown\"\nfx_px = {}\nfy_px = {}\ncx_px = {}\n\
-         cy_px = {}\ndistortion = {}\n[pose]\nrotation = {}\ntranslation_mm = {}\n",
-        t["image_size"],
-        k[0][0],
-        k[1][1],
-        k[0][2],
-        k[1][2],
-        t["dist_coeffs_k1_k2_p1_p2_k3"],
-        t["R_world_to_camera"],
-        t["t_world_to_camera_mm"],
+        "image_size_px = {size}\n[lens]\nmodel = \"brown\"\nfx_px = {fx}\nfy_px = {fy}\n\
+         cx_px = {cx}\ncy_px = {cy}\ndistortion = {lens}\n\
+         [pose]\nrotation = {turn}\ntranslation_mm = {shift}\n"
     );
     let nominal_mm_per_s = 1.02 * number(&t["belt_speed_mm_s"]);
     let config = format!(
@@ -360,7 +330,8 @@ fn product(video: &Path, truth: &Truth) -> [Dimensions; 4] {
     std::fs::write(folder.join("beltgauge.toml"), config).expect("writable");
     let mut command = Command::new(hil::beltgauge());
     command.args(["measure", "-", "--config", "beltgauge.toml", "--jsonl", "parcels.jsonl"]);
-    let mut ffmpeg = decode(video, &["-f", "yuv4mpegpipe", "-strict", "-1"]);
+    let mut ffmpeg = decoder(video, &["-f", "yuv4mpegpipe", "-strict", "-1"]);
+    let mut ffmpeg = ffmpeg.spawn().expect("ffmpeg is installed");
     let frames = ffmpeg.stdout.take().expect("piped");
     let ended = command.current_dir(&folder).stdin(frames).stdout(Stdio::null()).status();
     assert!(ended.expect("starts").success() && ffmpeg.wait().expect("ends").success());
@@ -407,7 +378,11 @@ fn beltgauge_is_several_times_as_exact_as_the_laboratory() {
         for (t, [l, w, h]) in sizes_mm.map(|all| all[i]).into_iter().enumerate() {
             print!("{l:7.1}{w:7.1}{h:7.1} {:5.2}", error(t, i));
             let mark = if i == REFERENCE { '*' } else { ' ' };
-            PUBLISHED.get(t).inspect(|p| print!("{mark}[{:4.1}]   ", p[i]));
+            if let Some(published) = PUBLISHED.get(t).map(|p| p[i]) {
+                let known = published.is_finite();
+                let published = if known { format!("{published:.1}") } else { "-".into() };
+                print!("{mark}[{published:>4}]   ");
+            }
         }
         println!();
     }

@@ -1,8 +1,9 @@
 //! The rooms that know source, pipeline and plc: offline measuring, the appliance, the demo,
-//! calibration.
+//! calibration, the error budget.
 
 mod annotate;
 mod appliance;
+pub mod budget;
 pub mod calibrate;
 pub mod demo;
 mod memory;

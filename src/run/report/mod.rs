@@ -1,9 +1,11 @@
-//! The calibration report: one self-contained HTML page with its pictures inside.
+//! Reports of calibration and budget: self-contained HTML pages with their pictures inside.
 
 mod belt;
+mod budget;
 mod lens;
 
 pub(super) use belt::{belt, points};
+pub(super) use budget::budget;
 pub(super) use lens::lens;
 
 use crate::error::{Error, Result};

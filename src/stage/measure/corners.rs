@@ -120,6 +120,13 @@ pub struct TopMotion {
     pub highest: f64,
 }
 
+impl TopMotion {
+    /// Of a top face that shows as much texture as one can use.
+    pub fn certain(ratio: f64) -> Self {
+        Self { ratio, sigma: RATIO_SIGMA_MIN, highest: ratio }
+    }
+}
+
 /// Follow the corners into a new view. `ratio`: expected image travel over belt travel.
 pub fn follow(
     corners: &mut [Corner],

@@ -40,7 +40,7 @@ const SHADOW_TRUST: f64 = 0.2;
 /// there is rather that from a dark side to the belt.
 const RISING_TRUST: f64 = 0.5;
 /// Steeper than this, grey levels a px, is no better: a label must not outdo a dark edge.
-const SLOPE_ENOUGH: f32 = 4.0;
+const SLOPE_ENOUGH: f32 = 3.0;
 /// A mean square silhouette residual that costs half of a fit's contrast. Shadows alone make 10
 /// of it.
 const REACH_ERROR_HALVES: f64 = 50.0;

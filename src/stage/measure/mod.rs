@@ -7,6 +7,7 @@
 //! two silhouettes from three starts each, then up to eight starts of twelve Gauss-Newton
 //! steps on the edges.
 
+pub mod budget;
 mod corners;
 mod fit;
 mod model;

@@ -222,7 +222,6 @@ impl Frame<'_> {
     }
 }
 
-#[cfg(test)]
 impl PassView {
     /// What a perfect camera sees of a cuboid; `distort` moves each step, mm, by sample index.
     pub(super) fn of(

@@ -1,0 +1,133 @@
+//! The error budget: what uncertainty a geometry leaves, from the fit's own normal equations
+//! on the views that a perfect camera would take (DESIGN: error budget).
+
+use super::corners::TopMotion;
+use super::fit::{Problem, Silhouette};
+use super::model::{HEIGHT, LENGTH, Outline, Params, Rounding, SCALE, WIDTH};
+use super::observe::PassView;
+use super::{EDGE_COUNT_MIN, VIEWS_PER_ZONE};
+use crate::belt::BeltPosition;
+use crate::camera::BeltView;
+use crate::units::BeltRect;
+use nalgebra::SVector;
+
+/// A geometry to judge.
+#[derive(Clone, Copy, Debug)]
+pub struct Geometry<'a> {
+    /// The belt view that the camera gives.
+    pub view: &'a BeltView,
+    /// The measuring zone.
+    pub zone: &'a BeltRect,
+    /// Tallest parcel, mm.
+    pub height_max_mm: f64,
+    /// Belt travel from frame to frame, mm.
+    pub travel_per_frame_mm: f64,
+}
+
+/// Expected standard deviations of length, width and height, mm, of a cuboid of `size_mm` turned by
+/// `yaw_deg` that passes through the middle of the zone. `textured`: corners on its top are
+/// followed. `None` when too little of it is seen to fit a cuboid.
+pub fn expected_sigma_mm(
+    geometry: &Geometry<'_>,
+    [length_mm, width_mm, height_mm]: [f64; 3],
+    yaw_deg: f64,
+    textured: bool,
+) -> Option<[f64; 3]> {
+    let zone = geometry.zone;
+    let centre = zone.centre();
+    let params = Params::from([
+        centre.x,
+        centre.y,
+        yaw_deg.to_radians(),
+        length_mm,
+        width_mm,
+        height_mm,
+        1.0,
+    ]);
+    let step_mm = geometry.travel_per_frame_mm.max(zone.length_mm() / VIEWS_PER_ZONE);
+    let reach_mm = 0.5 * zone.length_mm() + length_mm.hypot(width_mm);
+    let count = (reach_mm / step_mm).floor() as i32;
+    let views: Vec<PassView> = (-count..=count)
+        .map(|i| f64::from(i) * step_mm)
+        .map(|travel| PassView::of(&Outline::new(geometry.view, &params, travel), travel, |_| 0.0))
+        .collect();
+    // Measured all along by the belt's texture.
+    let mut end = BeltPosition::default();
+    end.advance(2.0 * reach_mm, true);
+    let ratio = geometry.view.magnification(height_mm);
+    let problem = Problem {
+        geometry: geometry.view,
+        zone,
+        height_max_mm: geometry.height_max_mm,
+        rounding: Rounding::default(),
+        reference_travel_mm: 0.0,
+        travel_sigma: end.sigma_since(&BeltPosition::default()),
+        silhouette: Silhouette::Whole,
+        enclosing: false,
+        top_motion: textured.then(|| TopMotion::certain(ratio)),
+    };
+    let estimate = problem.fit_edges(&views, params)?;
+    let near = (estimate.params - params).component_mul(&SVector::from(KEPT)).amax() < 1.0;
+    (near && estimate.edge_count >= EDGE_COUNT_MIN)
+        .then(|| [LENGTH, WIDTH, HEIGHT].map(|i| estimate.sigma[i]))
+}
+
+/// The parameters whose errors are mm.
+const KEPT: [f64; super::model::N] = {
+    let mut kept = [1.0; super::model::N];
+    kept[super::model::YAW] = 0.0;
+    kept[SCALE] = 0.0;
+    kept
+};
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::units::BeltMm;
+    use nalgebra::Vector2;
+
+    const ZONE: BeltRect =
+        BeltRect { x_min_mm: -500.0, x_max_mm: 500.0, y_min_mm: -350.0, y_max_mm: 350.0 };
+
+    fn sigma(height_of_camera_mm: f64, step_mm: f64, textured: bool) -> [f64; 3] {
+        let view = BeltView {
+            size_px: [1000, 700],
+            mm_per_px: height_of_camera_mm / 1000.0,
+            origin: BeltMm { x: -800.0, y: 600.0 },
+            nadir: Vector2::new(0.0, 0.0),
+            camera_height_mm: height_of_camera_mm,
+        };
+        let geometry = Geometry {
+            view: &view,
+            zone: &ZONE,
+            height_max_mm: 400.0,
+            travel_per_frame_mm: step_mm,
+        };
+        expected_sigma_mm(&geometry, [235.0, 125.0, 70.0], 20.0, textured).expect("seen")
+    }
+
+    #[test]
+    fn a_higher_camera_fewer_frames_and_a_plain_top_measure_worse() {
+        let [l, w, h] = sigma(1500.0, 20.0, true);
+        let [l_high, w_high, h_high] = sigma(3000.0, 20.0, true);
+        let [l_fast, w_fast, _] = sigma(1500.0, 200.0, true);
+        let [.., h_plain] = sigma(1500.0, 20.0, false);
+        assert!(l_high > l && w_high > w && h_high > h);
+        assert!(l_fast > l && w_fast > w);
+        assert!(h_plain > 1.2 * h, "{h_plain} {h}");
+    }
+
+    #[test]
+    fn what_is_seen_in_one_frame_only_is_not_measured() {
+        let view = BeltView {
+            size_px: [1000, 700],
+            mm_per_px: 1.5,
+            origin: BeltMm { x: -800.0, y: 600.0 },
+            nadir: Vector2::new(0.0, 0.0),
+            camera_height_mm: 1500.0,
+        };
+        let geometry =
+            Geometry { view: &view, zone: &ZONE, height_max_mm: 400.0, travel_per_frame_mm: 5e3 };
+        assert!(expected_sigma_mm(&geometry, [235.0, 125.0, 70.0], 20.0, true).is_none());
+    }
+}
