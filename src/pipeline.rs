@@ -285,6 +285,12 @@ impl Pipeline {
         let measured = self.measure.finish(slot, reference.at);
         // A pass that was cut short counts only if it could be measured.
         let measured = measured.filter(|m| m.has_edges || flags == Flags::default());
+        // A sliver of shadow or light is smaller than the smallest blob that counts.
+        let area_min_mm2 = self.site.config.segment.area_min_mm2;
+        let measured = measured.filter(|m| {
+            let p = &m.estimate.params;
+            p[measure::LENGTH] * p[measure::WIDTH] >= area_min_mm2
+        });
         let Some(measured) = measured else {
             self.counters.unmeasured += 1;
             return;

@@ -180,8 +180,26 @@ fn a_parcel_longer_than_the_zone_is_measured_by_its_motion() {
     let scenario =
         scenario(260, 500.0, &parcel([1300.0, 200.0, 120.0], 3.0, [-1700.0, 40.0], "kraft"));
     let pairs = matched(&scenario, &measure(&scenario, 500.0));
-    // Its ends are seen one after the other: the travel between adds 0.03 % of 1300 mm.
-    assert_sizes(&pairs, 3.0 * FOOTPRINT_MM, 3.0 * HEIGHT_MM);
+    // Its ends are seen one after the other, the leading one before there is an estimate that
+    // could predict its edge: the length is that of the silhouette, and says so.
+    assert_sizes(&pairs, 10.0, HEIGHT_MM);
+    assert!((pairs[0].1.width_mm - 200.0).abs() < FOOTPRINT_MM);
+    assert!(pairs[0].1.flags.has(Flags::FOOTPRINT_UNCERTAIN), "{:?}", pairs[0].1);
+}
+
+#[test]
+fn two_parcels_ten_mm_apart_are_two() {
+    // Low enough that one does not hide the gap to the other.
+    let beside = parcel([150.0, 100.0, 30.0], 0.0, [-1000.0, 20.0], "kraft")
+        + &parcel([150.0, 100.0, 30.0], 0.0, [-1000.0, -90.0], "white");
+    let behind = parcel([150.0, 100.0, 30.0], 0.0, [-1000.0, 20.0], "kraft")
+        + &parcel([150.0, 100.0, 30.0], 0.0, [-1160.0, 20.0], "white");
+    for (name, parcels) in [("beside", beside), ("behind", behind)] {
+        let scenario = scenario(180, 500.0, &parcels);
+        let records = measure(&scenario, 500.0);
+        assert_eq!(records.len(), 2, "{name}: {records:?}");
+        assert_sizes(&matched(&scenario, &records), 3.0 * FOOTPRINT_MM, HEIGHT_MM);
+    }
 }
 
 #[test]

@@ -196,6 +196,70 @@ pub fn top_motion(corners: &[Corner], zone_length_mm: f64, mm_per_px: f64) -> Op
     let variance = agreeing(crowd).map(|r| (r - mean).powi(2)).sum::<f64>() / (count - 1) as f64;
     let sigma = (variance / count as f64).sqrt().hypot(RATIO_SIGMA_MIN);
     let shared = |pair: &&[f64]| pair[1] - pair[0] <= AGREE;
-    let highest = ratios.windows(2).filter(shared).next_back().map_or(mean, |pair| pair[0]);
+    let highest = ratios.windows(2).rfind(shared).map_or(mean, |pair| pair[0]);
     Some(TopMotion { ratio: mean, sigma, highest })
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    const ZONE_MM: f64 = 1000.0;
+    const MM_PER_PX: f64 = 1.5;
+
+    /// A corner seen every 25 mm over 500 mm; `jump_mm` of it at half the way.
+    fn corner(ratio: f64, jump_mm: f64) -> Corner {
+        let mut corner = Corner { views: 1, followed: true, ..Corner::EMPTY };
+        for i in 1..=20 {
+            let t = 25.0 * f64::from(i);
+            let x = ratio * t + if i > 10 { jump_mm } else { 0.0 };
+            corner.views += 1;
+            corner.last_mm = [t, x];
+            for (sum, more) in corner.sums.iter_mut().zip([t, x, t * t, t * x, x * x]) {
+                *sum += more;
+            }
+        }
+        corner
+    }
+
+    fn motion(corners: &[Corner]) -> Option<TopMotion> {
+        top_motion(corners, ZONE_MM, MM_PER_PX)
+    }
+
+    #[test]
+    fn corners_that_agree_tell_the_ratio_of_their_plane() {
+        let corners = [1.0500, 1.0502, 1.0498, 1.0501].map(|r| corner(r, 0.0));
+        let found = motion(&corners).expect("agreed");
+        assert!((found.ratio - 1.050_025).abs() < 1e-6, "{found:?}");
+        assert!(found.sigma >= RATIO_SIGMA_MIN && found.sigma < 3e-4, "{found:?}");
+    }
+
+    #[test]
+    fn the_crowd_outvotes_what_is_elsewhere_and_two_make_a_height() {
+        let ratios = [1.05, 1.0502, 1.0498, 1.05, 1.02, 1.071, 1.0705, 1.12];
+        let found = motion(&ratios.map(|r| corner(r, 0.0))).expect("agreed");
+        assert!((found.ratio - 1.05).abs() < 1e-4, "{found:?}");
+        // One alone, at 1.12, may be wrong.
+        assert!((found.highest - 1.0705).abs() < 1e-6, "{found:?}");
+    }
+
+    #[test]
+    fn too_few_corners_or_none_that_agree_tell_nothing() {
+        assert_eq!(motion(&[]), None);
+        assert_eq!(motion(&[corner(1.05, 0.0), corner(1.05, 0.0)]), None);
+        assert_eq!(motion(&[1.02, 1.03, 1.04, 1.05, 1.06].map(|r| corner(r, 0.0))), None);
+    }
+
+    #[test]
+    fn a_corner_that_jumps_to_the_next_bar_or_goes_below_the_belt_is_none() {
+        assert_eq!(motion(&[corner(1.05, 6.0); 4]), None);
+        assert_eq!(motion(&[corner(0.95, 0.0); 4]), None);
+    }
+
+    #[test]
+    fn a_corner_followed_over_a_short_way_is_none() {
+        let mut short = corner(1.05, 0.0);
+        short.last_mm[0] = 0.2 * ZONE_MM;
+        assert_eq!(motion(&[short; 4]), None);
+    }
 }

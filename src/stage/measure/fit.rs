@@ -444,7 +444,7 @@ impl Problem<'_> {
                 std::array::from_fn(|e| self.trust(&outline, EdgeId(e as u8)));
             for sample in view.samples() {
                 let e = usize::from(sample.edge.0);
-                if trust[e] == [0.0; 2] {
+                if trust[e][0].max(trust[e][1]) <= 0.0 {
                     continue;
                 }
                 let Some((at, row)) = self.predict(&outline, sample) else { continue };

@@ -42,8 +42,12 @@ const VIEWS_PER_ZONE: f64 = 60.0;
 /// Fewer profiles than this cannot carry the fit.
 const EDGE_COUNT_MIN: usize = 60;
 
-/// Below this share of profiles with an edge where the cuboid has one, it is no cuboid.
+/// Below this share of profiles with an edge where the cuboid has one, it is no cuboid, ...
 const BOX_EDGE_SHARE_MIN: f64 = 0.78;
+/// ... unless its edges are faint (a dark parcel's): then this share will do ...
+const FAINT_EDGE_SHARE_MIN: f64 = 0.5;
+/// ... when the silhouettes agree with it to this mean square, in units of their sigma.
+const FAINT_REACH_ERROR_MAX: f64 = 2.0;
 
 /// The result of a pass.
 #[derive(Clone, Copy, Debug)]
@@ -265,12 +269,16 @@ impl Measure {
             edges.filter(|e| e.edge_count >= EDGE_COUNT_MIN).or(Some(reach))
         });
         let mut result = match cuboid {
-            Some(cuboid) if cuboid.edge_share >= BOX_EDGE_SHARE_MIN => {
+            Some(cuboid) if is_box(&cuboid) => {
                 let problem = self.problem(slot, Silhouette::Whole);
                 let disputed = problem.height_disputed(self.views(slot), &cuboid);
                 Measured { estimate: cuboid, is_box: true, has_edges: true, disputed }
             }
             other => {
+                #[expect(
+                    clippy::redundant_closure_for_method_calls,
+                    reason = "the method itself is not general over the problem's lifetime"
+                )]
                 let enclosing = self.best(slot, |problem, views| problem.fit_enclosing(views));
                 let estimate = enclosing.or(other).or(self.passes[slot].estimate)?;
                 let has_edges = other.is_some_and(|e| e.edge_count > 0);
@@ -295,6 +303,12 @@ impl Measure {
         let score = |e: &Option<Estimate>| e.map_or(f64::NEG_INFINITY, |e| e.score());
         if score(&bright) > score(&whole) { bright } else { whole }
     }
+}
+
+fn is_box(cuboid: &Estimate) -> bool {
+    let faint =
+        cuboid.edge_share >= FAINT_EDGE_SHARE_MIN && cuboid.reach_error <= FAINT_REACH_ERROR_MAX;
+    cuboid.edge_share >= BOX_EDGE_SHARE_MIN || faint
 }
 
 #[cfg(test)]
@@ -330,10 +344,9 @@ mod tests {
             .collect()
     }
 
-    fn fit(views: &[PassView], travel_sigma: f64) -> Option<Estimate> {
-        let geometry = geometry();
-        let problem = Problem {
-            geometry: &geometry,
+    fn problem(geometry: &BeltView, travel_sigma: f64) -> Problem<'_> {
+        Problem {
+            geometry,
             zone: &ZONE,
             height_max_mm: 400.0,
             rounding: Rounding::default(),
@@ -342,7 +355,12 @@ mod tests {
             silhouette: Silhouette::Whole,
             enclosing: false,
             top_motion: None,
-        };
+        }
+    }
+
+    fn fit(views: &[PassView], travel_sigma: f64) -> Option<Estimate> {
+        let geometry = geometry();
+        let problem = problem(&geometry, travel_sigma);
         let reach = problem.fit_reach(views, None)?;
         problem.fit_edges(views, reach.params).map(canonical_estimate)
     }
@@ -429,6 +447,49 @@ mod tests {
         let truth = cuboid(150.0, 40.0, [250.0, 150.0, 100.0]);
         let wild = |i: usize| if i.is_multiple_of(4) { 30.0 * noise(i) } else { 0.3 * noise(i) };
         assert_near(&fit(&pass(&truth, wild), 3e-4).expect("fits"), &truth, 0.5);
+    }
+
+    #[test]
+    fn an_enclosing_cuboid_holds_what_fills_it_only_in_part() {
+        let truth = cuboid(120.0, 30.0, [235.0, 125.0, 70.0]);
+        let mut views = pass(&truth, |_| 0.0);
+        // A round end: four of the directions reach 8 mm less.
+        for reach in views.iter_mut().flat_map(|v| v.reach_mm.iter_mut()) {
+            for k in [1, 2, 7, 8] {
+                reach[k] -= 8.0;
+            }
+        }
+        let geometry = geometry();
+        let problem = Problem { top_motion: None, ..problem(&geometry, 3e-4) };
+        let [filling, enclosing] = [problem.fit_reach(&views, None), problem.fit_enclosing(&views)]
+            .map(|e| e.expect("fits"));
+        let short = |e: &Estimate| {
+            let e = canonical_estimate(*e);
+            [LENGTH, WIDTH].map(|i| truth[i] - e.params[i]).into_iter().fold(0.0, f64::max)
+        };
+        assert!(short(&enclosing) < 1.0, "{enclosing:?}");
+        assert!(short(&filling) > short(&enclosing) + 1.0, "{filling:?}");
+        assert!(enclosing.sigma[LENGTH] > 3.0);
+    }
+
+    #[test]
+    fn corners_decide_the_height_that_edges_leave_open() {
+        let truth = cuboid(120.0, 30.0, [235.0, 125.0, 70.0]);
+        let mut low = truth;
+        low[HEIGHT] = 64.0;
+        let geometry = geometry();
+        let ratio = geometry.magnification(70.0);
+        let top_motion = Some(corners::TopMotion::certain(ratio));
+        let problem = Problem { top_motion, ..problem(&geometry, 3e-4) };
+        let views = pass(&truth, |_| 0.0);
+        let estimate = problem.fit_edges(&views, truth).expect("fits");
+        assert!((estimate.params[HEIGHT] - 70.0).abs() < EXACT_MM);
+        assert!(!problem.height_disputed(&views, &estimate));
+        // Edges of a parcel 6 mm lower than its corners say: one of them is wrong.
+        let views = pass(&low, |_| 0.0);
+        let estimate = problem.fit_edges(&views, truth).expect("fits");
+        assert!(estimate.params[HEIGHT] > 66.0, "{estimate:?}");
+        assert!(problem.height_disputed(&views, &estimate));
     }
 
     #[test]

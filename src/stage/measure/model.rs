@@ -195,7 +195,7 @@ pub fn named_like(mut params: Params, other: &Params) -> Params {
     use std::f64::consts::FRAC_PI_2;
     let quarters = ((other[YAW] - params[YAW]) / FRAC_PI_2).round();
     params[YAW] += quarters * FRAC_PI_2;
-    if quarters.rem_euclid(2.0) == 1.0 {
+    if quarters.rem_euclid(2.0) > 0.5 {
         params.swap_rows(LENGTH, WIDTH);
     }
     params
