@@ -154,6 +154,12 @@ struct EdgeUse {
 }
 
 impl Estimate {
+    /// Whether another estimate puts the top face elsewhere, beyond what both leave open.
+    pub fn disputes_height(&self, other: &Self) -> bool {
+        let sigma_mm = self.sigma[HEIGHT].hypot(other.sigma[HEIGHT]);
+        (self.params[HEIGHT] - other.params[HEIGHT]).abs() > DISPUTED_SIGMA * sigma_mm
+    }
+
     /// What tells a right fit from a wrong one: contrast, less what the silhouettes disagree; of
     /// silhouettes alone, their agreement.
     pub fn score(&self) -> f64 {
@@ -198,17 +204,6 @@ impl Problem<'_> {
             estimate.sigma[i] = estimate.sigma[i].hypot(ENCLOSING_SIGMA_MM);
         }
         Some(estimate)
-    }
-
-    /// Whether edges alone, without the corners, put the top face far from `estimate`'s.
-    pub fn height_disputed(&self, views: &[PassView], estimate: &Estimate) -> bool {
-        let edges = Self { top_motion: None, ..*self };
-        let without = edges.refine_edges(views, estimate.params);
-        self.top_motion.is_some()
-            && without.is_some_and(|e| {
-                let difference_mm = (e.params[HEIGHT] - estimate.params[HEIGHT]).abs();
-                difference_mm > DISPUTED_SIGMA * e.sigma[HEIGHT].hypot(estimate.sigma[HEIGHT])
-            })
     }
 
     /// Fit edges, starting from an estimate of the silhouettes. On a side that faces the camera

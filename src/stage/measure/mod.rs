@@ -49,6 +49,10 @@ const FAINT_EDGE_SHARE_MIN: f64 = 0.5;
 /// ... when the silhouettes agree with it to this mean square, in units of their sigma.
 const FAINT_REACH_ERROR_MAX: f64 = 2.0;
 
+/// Corners below the edges' top face with which the fit keeps less than this share of its score
+/// are on a side.
+const LED_AWAY_SCORE: f64 = 0.8;
+
 /// The result of a pass.
 #[derive(Clone, Copy, Debug)]
 pub struct Measured {
@@ -261,17 +265,9 @@ impl Measure {
 
     /// The final estimate, X at belt position `at`, length >= width.
     pub fn finish(&self, slot: usize, at: BeltPosition) -> Option<Measured> {
-        let cuboid = self.best(slot, |problem, views| {
-            let reach = problem.fit_reach(views, None)?;
-            // Profiles were taken across the faces of the running estimate.
-            let running = self.passes[slot].estimate.map_or(reach.params, |e| e.params);
-            let edges = problem.fit_edges(views, named_like(reach.params, &running));
-            edges.filter(|e| e.edge_count >= EDGE_COUNT_MIN).or(Some(reach))
-        });
+        let (cuboid, disputed) = self.cuboid(slot);
         let mut result = match cuboid {
             Some(cuboid) if is_box(&cuboid) => {
-                let problem = self.problem(slot, Silhouette::Whole);
-                let disputed = problem.height_disputed(self.views(slot), &cuboid);
                 Measured { estimate: cuboid, is_box: true, has_edges: true, disputed }
             }
             other => {
@@ -290,6 +286,35 @@ impl Measure {
         params[X] += params[SCALE] * travel;
         result.estimate = canonical_estimate(result.estimate);
         Some(result)
+    }
+
+    /// The cuboid that edges and corners show, and whether they dispute its height. Corners that
+    /// lead away from the edges are not on the top face.
+    fn cuboid(&self, slot: usize) -> (Option<Estimate>, bool) {
+        let fit = |with_corners: bool| {
+            self.best(slot, |problem, views| {
+                let top_motion = problem.top_motion.filter(|_| with_corners);
+                let problem = Problem { top_motion, ..*problem };
+                let reach = problem.fit_reach(views, None)?;
+                // Profiles were taken across the faces of the running estimate.
+                let running = self.passes[slot].estimate.map_or(reach.params, |e| e.params);
+                let edges = problem.fit_edges(views, named_like(reach.params, &running));
+                edges.filter(|e| e.edge_count >= EDGE_COUNT_MIN).or(Some(reach))
+            })
+        };
+        let edges = fit(false);
+        if self.problem(slot, Silhouette::Whole).top_motion.is_none() {
+            return (edges, false);
+        }
+        let both = fit(true);
+        let disputed = both.zip(edges).is_some_and(|(both, edges)| both.disputes_height(&edges));
+        let led_away = both.zip(edges).is_some_and(|(both, edges)| {
+            // Texture above a box's top there is not: it is no box then.
+            edges.edge_count > 0
+                && both.params[HEIGHT] < edges.params[HEIGHT]
+                && both.score() < LED_AWAY_SCORE * edges.score()
+        });
+        (if led_away { edges } else { both.or(edges) }, disputed)
     }
 
     /// The better fit of the whole blob and of its bright part.
@@ -482,14 +507,18 @@ mod tests {
         let top_motion = Some(corners::TopMotion::certain(ratio));
         let problem = Problem { top_motion, ..problem(&geometry, 3e-4) };
         let views = pass(&truth, |_| 0.0);
-        let estimate = problem.fit_edges(&views, truth).expect("fits");
-        assert!((estimate.params[HEIGHT] - 70.0).abs() < EXACT_MM);
-        assert!(!problem.height_disputed(&views, &estimate));
+        let fit = |problem: &Problem<'_>, views: &[PassView]| {
+            problem.fit_edges(views, truth).expect("fits")
+        };
+        let edges_alone = Problem { top_motion: None, ..problem };
+        let both = fit(&problem, &views);
+        assert!((both.params[HEIGHT] - 70.0).abs() < EXACT_MM);
+        assert!(!both.disputes_height(&fit(&edges_alone, &views)));
         // Edges of a parcel 6 mm lower than its corners say: one of them is wrong.
         let views = pass(&low, |_| 0.0);
-        let estimate = problem.fit_edges(&views, truth).expect("fits");
-        assert!(estimate.params[HEIGHT] > 66.0, "{estimate:?}");
-        assert!(problem.height_disputed(&views, &estimate));
+        let both = fit(&problem, &views);
+        assert!(both.params[HEIGHT] > 66.0, "{both:?}");
+        assert!(both.disputes_height(&fit(&edges_alone, &views)));
     }
 
     #[test]
