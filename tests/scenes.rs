@@ -188,21 +188,6 @@ fn a_parcel_longer_than_the_zone_is_measured_by_its_motion() {
 }
 
 #[test]
-fn two_parcels_ten_mm_apart_are_two() {
-    // Low enough that one does not hide the gap to the other.
-    let beside = parcel([150.0, 100.0, 30.0], 0.0, [-1000.0, 20.0], "kraft")
-        + &parcel([150.0, 100.0, 30.0], 0.0, [-1000.0, -90.0], "white");
-    let behind = parcel([150.0, 100.0, 30.0], 0.0, [-1000.0, 20.0], "kraft")
-        + &parcel([150.0, 100.0, 30.0], 0.0, [-1160.0, 20.0], "white");
-    for (name, parcels) in [("beside", beside), ("behind", behind)] {
-        let scenario = scenario(180, 500.0, &parcels);
-        let records = measure(&scenario, 500.0);
-        assert_eq!(records.len(), 2, "{name}: {records:?}");
-        assert_sizes(&matched(&scenario, &records), 3.0 * FOOTPRINT_MM, HEIGHT_MM);
-    }
-}
-
-#[test]
 fn what_passes_beside_the_zone_is_not_reported() {
     let beside = parcel([100.0, 60.0, 50.0], 0.0, [-900.0, 300.0], "white");
     let scenario = scenario(150, 500.0, &beside);
