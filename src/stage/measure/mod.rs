@@ -4,8 +4,8 @@
 //! [`Estimate`] at any time, final when the parcel has left. Owns: the views of every pass.
 //! Limits: `limits.views_per_track_max`; a full pass is thinned to every second view.
 //! Cost: a few 10 us a frame and track; a refit every fourth view; in the frame of the exit
-//! two silhouettes from three starts each, then up to eight starts of twelve Gauss-Newton
-//! steps on the edges.
+//! two silhouettes from three starts each, then up to 17 starts of twelve Gauss-Newton steps on
+//! the edges, with the corners and without: tens of ms, not spread over frames yet.
 
 pub mod budget;
 mod corners;
