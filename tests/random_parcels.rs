@@ -322,7 +322,8 @@ fn judge(rows: &[Row], complaints: &[String]) {
         complaints.len()
     );
     assert!(complaints.is_empty(), "{}", complaints.join("\n"));
-    // Over 500 parcels p99 is 2.5 mm; over 200 it is the sixth largest error of 600 and scatters.
+    // 2.66 mm is reached, 2.5 is wanted: small black parcels with a white label near their edge. The
+    // sixth largest of 600 errors moves by some tenths with any change: the gate leaves room for that.
     assert!(mean <= 0.6 && p99 <= 3.0, "mean {mean:.3} mm, p99 {p99:.2} mm");
     assert!(share >= 0.9, "only {share:.3} of the errors are within 2 sigma + 0.3 mm");
 }
