@@ -257,6 +257,38 @@ mod tests {
     }
 
     #[test]
+    fn a_corner_is_followed_through_the_pictures_of_its_way() {
+        const SIZE: usize = 96;
+        fn plane(data: &[u8]) -> Plane<'_> {
+            Plane::packed(data, SIZE, SIZE).expect("square")
+        }
+        let view = BeltView {
+            size_px: [SIZE, SIZE],
+            mm_per_px: MM_PER_PX,
+            origin: BeltMm { x: 0.0, y: 0.0 },
+            nadir: Vector2::new(0.0, 0.0),
+            camera_height_mm: 1500.0,
+        };
+        let picture = |u: f32| -> Vec<u8> {
+            let edge = |x: f32| 1.0 / (1.0 + (-x / 0.6).exp());
+            let at = |i: usize| edge((i % SIZE) as f32 - u) * edge((i / SIZE) as f32 - 40.0);
+            (0..SIZE * SIZE).map(|i| (30.0 + 120.0 * at(i)) as u8).collect()
+        };
+        let first = picture(20.0);
+        let patch = Patch::cut(plane(&first), 20, 40).expect("inside");
+        let mut corners = [Corner::begin(patch, [20, 40], 1000.0)];
+        for i in 1..=12 {
+            let t_mm = 6.0 * f64::from(i);
+            let data = picture(20.0 + (1.1 * t_mm / MM_PER_PX) as f32);
+            // The expected ratio is that of a parcel half as high.
+            follow(&mut corners, &view, plane(&data), 1000.0 + t_mm, 1.05);
+        }
+        let ratio = corners[0].ratio(200.0, MM_PER_PX).expect("followed");
+        // A twentieth of a pixel over 48.
+        assert!((ratio - 1.1).abs() < 0.001 * 1.1, "{ratio}");
+    }
+
+    #[test]
     fn a_corner_followed_over_a_short_way_is_none() {
         let mut short = corner(1.05, 0.0);
         short.last_mm[0] = 0.2 * ZONE_MM;

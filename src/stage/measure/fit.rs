@@ -541,3 +541,32 @@ pub fn canonical_estimate(mut estimate: Estimate) -> Estimate {
     estimate.params = canonical(estimate.params);
     estimate
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::kernel::scalar::profile::Step;
+
+    fn sample(steps: [(f32, f32); 2]) -> EdgeSample {
+        let mut sample = EdgeSample::EMPTY;
+        for (kept, (at, slope)) in sample.steps.iter_mut().zip(steps) {
+            *kept = Step { at, slope };
+        }
+        sample
+    }
+
+    #[test]
+    fn a_label_further_away_does_not_outdo_a_dark_edge() {
+        let chosen = choose(&sample([(0.5, -4.0), (-4.0, -60.0)]), 0.0, 6.0, 0.0, 1.0);
+        assert_eq!(chosen, Some((0.5, -4.0)));
+    }
+
+    #[test]
+    fn above_a_visible_side_the_falling_edge_is_the_top_one() {
+        let steps = sample([(1.0, 3.0), (-1.0, -3.0)]);
+        let chosen = choose(&steps, 0.2, 6.0, 0.0, RISING_TRUST);
+        assert_eq!(chosen.map(|c| c.1), Some(-3.0));
+        // Where rising edges are as likely, the nearer one is taken.
+        assert_eq!(choose(&steps, 0.2, 6.0, 0.0, 1.0).map(|c| c.1), Some(3.0));
+    }
+}

@@ -33,12 +33,15 @@ pub struct EdgeSample {
     pub steps: [Step; STEPS],
 }
 
-const NO_SAMPLE: EdgeSample = EdgeSample {
-    edge: EdgeId(0),
-    anchor: [0.0; 2],
-    outward: [0.0; 2],
-    steps: [Step { at: 0.0, slope: 0.0 }; STEPS],
-};
+impl EdgeSample {
+    /// None.
+    pub const EMPTY: Self = Self {
+        edge: EdgeId(0),
+        anchor: [0.0; 2],
+        outward: [0.0; 2],
+        steps: [Step { at: 0.0, slope: 0.0 }; STEPS],
+    };
+}
 
 /// One frame's share of a pass.
 #[derive(Clone, Copy, Debug)]
@@ -58,7 +61,7 @@ impl PassView {
     pub const EMPTY: Self = Self {
         travel_mm: 0.0,
         reach_mm: [[f32::NAN; DIRECTIONS]; 2],
-        samples: [NO_SAMPLE; EDGES * SAMPLES_PER_EDGE],
+        samples: [EdgeSample::EMPTY; EDGES * SAMPLES_PER_EDGE],
         sample_count: 0,
     };
 
@@ -207,7 +210,7 @@ impl Frame<'_> {
             [px.u as f32 - SEARCH_PX as f32 * step[0], px.v as f32 - SEARCH_PX as f32 * step[1]];
         let mut profile = [0.0; 2 * SEARCH_PX + 1];
         sample(self.grey, start, step, PROFILE_HALF_WIDTH, &mut profile)?;
-        let mut found = NO_SAMPLE.steps;
+        let mut found = EdgeSample::EMPTY.steps;
         // A profile without a step counts: it shows that no edge is here.
         steps(&profile, SLOPE_MIN, &mut found);
         for step in found.iter_mut().filter(|s| s.slope != 0.0) {
@@ -244,7 +247,7 @@ impl PassView {
                     edge,
                     anchor: [anchor.x as f32, anchor.y as f32],
                     outward: [outward.x as f32, outward.y as f32],
-                    ..NO_SAMPLE
+                    ..EdgeSample::EMPTY
                 };
                 sample.steps[0] = Step { at: distort(count), slope: -20.0 };
                 view.samples[count] = sample;

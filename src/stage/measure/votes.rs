@@ -90,3 +90,34 @@ fn outermost_peak(votes: &[[f64; VOTE_BINS]; 2], first_px: f64) -> Option<f64> {
     })?;
     Some(VOTE_FIRST_PX + (peak as f64 + 0.5) * VOTE_BIN_PX)
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn votes(places: &[(f64, f64)]) -> [f64; VOTE_BINS] {
+        let mut votes = [0.0; VOTE_BINS];
+        for (px, count) in places {
+            votes[((px - VOTE_FIRST_PX) / VOTE_BIN_PX) as usize] = *count;
+        }
+        votes
+    }
+
+    #[test]
+    fn of_edges_that_are_as_good_the_outermost_is_taken_and_a_weak_one_is_not() {
+        let none = [0.0; VOTE_BINS];
+        let seen = votes(&[(-12.0, 100.0), (-3.0, 90.0), (4.0, 50.0)]);
+        let found = outermost_peak(&[seen, none], -30.0).expect("votes");
+        assert!((found + 3.0).abs() <= 1.0, "{found}");
+        assert_eq!(outermost_peak(&[none, none], -30.0), None);
+    }
+
+    #[test]
+    fn a_dark_parcel_s_rising_and_falling_edge_add_up() {
+        // In one histogram they would cancel, and the label inside would win.
+        let hidden = votes(&[(-1.0, 60.0), (-14.0, -70.0)]);
+        let visible = votes(&[(-1.0, -60.0)]);
+        let found = outermost_peak(&[hidden, visible], -30.0).expect("votes");
+        assert!((found + 1.0).abs() <= 1.0, "{found}");
+    }
+}
