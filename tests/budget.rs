@@ -1,11 +1,11 @@
 //! The error budget against the scatter of synthetic runs.
 
+mod common;
+
 use beltgauge::config::{Config, Site};
-use beltgauge::image::Plane;
-use beltgauge::run;
-use beltgauge::source::FrameSource;
-use beltgauge::source::synthetic::{Scenario, Synthetic};
+use beltgauge::source::synthetic::Scenario;
 use beltgauge::stage::measure::budget::{Geometry, expected_sigma_mm};
+use common::measure_scenario;
 use std::fmt::Write as _;
 
 const SIZE_MM: [f64; 3] = [235.0, 125.0, 70.0];
@@ -51,15 +51,7 @@ fn the_expected_sigma_is_that_of_synthetic_runs() {
     // The parcels have tape and a label: texture.
     let expected = expected_sigma_mm(&geometry, SIZE_MM, YAW_DEG, true).expect("seen");
 
-    let (mut frames, mut pipeline) = run::build(site.clone()).expect("fits");
-    let mut frame = frames.pop().expect("planned");
-    let mut source = Synthetic::new(scenario).expect("renders");
-    let [width, height] = source.size_px();
-    let mut records = Vec::new();
-    while let Some(time) = source.next_into(&mut frame).expect("renders") {
-        let raw = Plane::packed(&frame, width, height).expect("this size");
-        pipeline.step(raw, time, &mut |r| records.push(r)).expect("this size");
-    }
+    let records = measure_scenario(&scenario, site.clone());
     assert_eq!(records.len(), 12);
     let rms = |error: &dyn Fn(usize) -> f64| {
         ((0..12).map(|i| error(i).powi(2)).sum::<f64>() / 12.0).sqrt()

@@ -3,12 +3,12 @@
 //! Every parcel goes to `target/tmp/random_parcels.csv`, a plot of the errors to `.svg` beside it.
 //! `VARIANT=` `no_blur`, `no_noise`, `no_rounding` or `true_speed` takes one source of error away.
 
+mod common;
+
 use beltgauge::config::{Config, Site};
 use beltgauge::event::{ParcelRecord, Shape};
-use beltgauge::image::Plane;
-use beltgauge::run;
-use beltgauge::source::FrameSource;
-use beltgauge::source::synthetic::{Parcel, Random, Scenario, Synthetic};
+use beltgauge::source::synthetic::{Parcel, Random, Scenario};
+use common::measure_scenario;
 use nalgebra::{Matrix3, Rotation3, Vector3};
 use std::fmt::Write as _;
 use std::sync::Mutex;
@@ -165,16 +165,7 @@ fn run_belt(seed: u64) -> (Vec<Row>, Vec<String>) {
         Config::parse(&config).expect("valid"),
         scenario.camera().expect("a valid camera"),
     );
-    let (mut frames, mut pipeline) = run::build(site.expect("a zone in view")).expect("fits");
-    let mut frame = frames.pop().expect("planned");
-    let mut source = Synthetic::new(scenario.clone()).expect("renders");
-    let [width, height] = source.size_px();
-    let mut records = Vec::new();
-    while let Some(time) = source.next_into(&mut frame).expect("renders") {
-        let raw = Plane::packed(&frame, width, height).expect("this size");
-        pipeline.step(raw, time, &mut |r| records.push(r)).expect("this size");
-    }
-    pipeline.finish(&mut |r| records.push(r));
+    let records = measure_scenario(&scenario, site.expect("a zone in view"));
     matched(seed, &scenario, &records)
 }
 

@@ -8,6 +8,7 @@ use beltgauge::image::Plane;
 use beltgauge::run;
 use beltgauge::source::FrameSource;
 use beltgauge::source::synthetic::{Parcel, Scenario, Synthetic};
+use common::measure_scenario;
 use std::fmt::Write as _;
 use std::io::Write as _;
 
@@ -56,21 +57,7 @@ fn site(scenario: &Scenario, nominal_mm_per_s: f64) -> Site {
 
 /// Measure a scenario with a nominal belt speed.
 fn measure(scenario: &Scenario, nominal_mm_per_s: f64) -> Vec<ParcelRecord> {
-    measure_at(scenario, site(scenario, nominal_mm_per_s))
-}
-
-fn measure_at(scenario: &Scenario, site: Site) -> Vec<ParcelRecord> {
-    let mut source = Synthetic::new(scenario.clone()).expect("renders");
-    let (mut frames, mut pipeline) = run::build(site).expect("fits");
-    let mut frame = frames.pop().expect("planned");
-    let [width, height] = source.size_px();
-    let mut records = Vec::new();
-    while let Some(time) = source.next_into(&mut frame).expect("renders") {
-        let raw = Plane::packed(&frame, width, height).expect("this size");
-        pipeline.step(raw, time, &mut |r| records.push(r)).expect("this size");
-    }
-    pipeline.finish(&mut |r| records.push(r));
-    records
+    measure_scenario(scenario, site(scenario, nominal_mm_per_s))
 }
 
 /// Every record with its parcel; fails unless each parcel has exactly one record.
@@ -195,7 +182,7 @@ fn what_passes_beside_the_zone_is_not_reported() {
     narrow.zone.y_max_mm = 200.0;
     let camera = scenario.camera().expect("valid");
     let narrow = Site::new(narrow, camera).expect("a zone in view");
-    assert_eq!(measure_at(&scenario, narrow), []);
+    assert_eq!(measure_scenario(&scenario, narrow), []);
 }
 
 #[test]

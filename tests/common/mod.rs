@@ -1,6 +1,11 @@
 //! What several tests share: the command, scratch folders and the shared data.
 #![allow(dead_code)] // each test uses its part
 
+use beltgauge::config::Site;
+use beltgauge::event::ParcelRecord;
+use beltgauge::image::Plane;
+use beltgauge::source::FrameSource;
+use beltgauge::source::synthetic::{Scenario, Synthetic};
 use std::path::{Path, PathBuf};
 use std::process::{Command, Output};
 
@@ -53,4 +58,19 @@ pub fn write_site(folder: &Path, image_size_px: [usize; 2]) -> PathBuf {
     let path = folder.join("beltgauge.toml");
     std::fs::write(&path, config).expect("writable");
     path
+}
+
+/// What the pipeline of a site reports of a synthetic belt.
+pub fn measure_scenario(scenario: &Scenario, site: Site) -> Vec<ParcelRecord> {
+    let mut source = Synthetic::new(scenario.clone()).expect("renders");
+    let (mut frames, mut pipeline) = beltgauge::run::build(site).expect("fits");
+    let mut frame = frames.pop().expect("planned");
+    let [width, height] = source.size_px();
+    let mut records = Vec::new();
+    while let Some(time) = source.next_into(&mut frame).expect("renders") {
+        let raw = Plane::packed(&frame, width, height).expect("this size");
+        pipeline.step(raw, time, &mut |r| records.push(r)).expect("this size");
+    }
+    pipeline.finish(&mut |r| records.push(r));
+    records
 }
