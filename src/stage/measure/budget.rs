@@ -65,6 +65,7 @@ pub fn expected_sigma_mm(
         silhouette: Silhouette::Whole,
         enclosing: false,
         top_motion: textured.then(|| TopMotion::certain(ratio)),
+        view_stride: 1,
     };
     let estimate = problem.fit_edges(&views, params)?;
     let near = (estimate.params - params).component_mul(&SVector::from(KEPT)).amax() < 1.0;

@@ -11,6 +11,7 @@ use super::model::{
     YAW, canonical, direction,
 };
 use super::observe::{EdgeSample, PassView};
+use super::votes::FaceVote;
 use crate::camera::BeltView;
 use crate::units::BeltRect;
 use nalgebra::{SMatrix, SVector, Vector2};
@@ -23,6 +24,8 @@ const REACH_GUARD_SIGMA_MM: f64 = 12.0;
 const EDGE_SIGMA_PX: f64 = 0.35;
 /// The gate around a predicted edge, px, closing with the iterations.
 const GATES_PX: [f64; 12] = [6.0, 6.0, 5.0, 4.0, 3.0, 2.5, 2.0, 2.0, 2.0, 2.0, 2.0, 2.0];
+/// From here on the gates suit a start that was found among others.
+const NEAR_GATE: usize = 4;
 /// An edge's polarity is settled once the gate is this narrow, px.
 const POLARITY_GATE_PX: f64 = 5.0;
 /// A base edge nearer than this to its top edge cannot be told from it.
@@ -41,6 +44,8 @@ const SHADOW_TRUST: f64 = 0.2;
 const RISING_TRUST: f64 = 0.5;
 /// Steeper than this, grey levels a px, is no better: a label must not outdo a dark edge.
 const SLOPE_ENOUGH: f32 = 3.0;
+/// Views that are enough to choose the right start.
+const SEARCH_VIEWS: usize = 20;
 /// A mean square silhouette residual that costs half of a fit's contrast. Shadows alone make 10
 /// of it.
 const REACH_ERROR_HALVES: f64 = 50.0;
@@ -80,6 +85,8 @@ pub struct Problem<'a> {
     pub enclosing: bool,
     /// What corners on the top face tell.
     pub top_motion: Option<TopMotion>,
+    /// Only every so many views are looked at.
+    pub view_stride: usize,
 }
 
 /// Which of a view's reaches.
@@ -177,6 +184,11 @@ impl Problem<'_> {
         Outline::rounded(self.geometry, self.rounding, params, travel_mm)
     }
 
+    /// The views with profiles.
+    pub(super) fn sampled<'v>(&self, views: &'v [PassView]) -> impl Iterator<Item = &'v PassView> {
+        views.iter().filter(|v| !v.samples().is_empty()).step_by(self.view_stride)
+    }
+
     /// Fit silhouettes only, from `start` or from scratch.
     pub fn fit_reach(&self, views: &[PassView], start: Option<Params>) -> Option<Estimate> {
         let candidates = match start {
@@ -206,13 +218,25 @@ impl Problem<'_> {
         Some(estimate)
     }
 
-    /// Fit edges, starting from an estimate of the silhouettes. On a side that faces the camera
-    /// the strongest edge may be the top one or the one on the belt: both are tried, and the
-    /// cuboid that explains more contrast is kept.
+    /// Fit edges, starting from an estimate of the silhouettes: the best of several starts, tried
+    /// on some of the views, then on all of them.
     pub fn fit_edges(&self, views: &[PassView], start: Params) -> Option<Estimate> {
-        let found = self.face_votes(views, &start);
+        let view_stride = (views.len() / SEARCH_VIEWS).max(1);
+        let search = Self { view_stride, ..*self };
+        let start = search.search_edges(views, start, &self.face_votes(views, &start))?.params;
+        self.refine_edges(views, start, &GATES_PX[NEAR_GATE..])
+    }
+
+    /// On a side that faces the camera the strongest edge may be the top one or the one on the
+    /// belt: both are tried, and the cuboid that explains more contrast is kept.
+    fn search_edges(
+        &self,
+        views: &[PassView],
+        start: Params,
+        found: &[FaceVote; 4],
+    ) -> Option<Estimate> {
         // Without shadows the silhouette itself is near enough.
-        let mut best = self.refine_edges(views, start);
+        let mut best = self.refine_edges(views, start, &GATES_PX);
         for as_base in 0..16u8 {
             let takes = |k: usize| as_base >> k & 1 == 1;
             if (0..4).any(|k| takes(k) && found[k].side_depth_mm.is_none()) {
@@ -222,7 +246,7 @@ impl Problem<'_> {
                 let depth = if takes(k) { found[k].side_depth_mm } else { None };
                 found[k].offset_mm - depth.unwrap_or(0.0)
             });
-            let fitted = self.refine_edges(views, self.moved(start, offsets));
+            let fitted = self.refine_edges(views, self.moved(start, offsets), &GATES_PX);
             let score = |e: &Option<Estimate>| e.map_or(f64::NEG_INFINITY, |e| e.score());
             if score(&fitted) > score(&best) {
                 best = fitted;
@@ -231,12 +255,22 @@ impl Problem<'_> {
         best
     }
 
+    /// The same cuboid's fit without the corners.
+    pub fn without_corners(&self, views: &[PassView], both: &Estimate) -> Option<Estimate> {
+        Self { top_motion: None, ..*self }.refine_edges(views, both.params, &GATES_PX[NEAR_GATE..])
+    }
+
     /// Gauss-Newton on the edges, the gate closing.
-    fn refine_edges(&self, views: &[PassView], start: Params) -> Option<Estimate> {
+    fn refine_edges(
+        &self,
+        views: &[PassView],
+        start: Params,
+        gates_px: &[f64],
+    ) -> Option<Estimate> {
         let mut params = start;
         let mut polarity = [[0.0; 2]; EDGES];
         let mut last = None;
-        for gate_px in GATES_PX {
+        for &gate_px in gates_px {
             let gate_mm = gate_px * self.geometry.mm_per_px;
             let mut edges = self.priors(&params);
             let used = self.add_edges(views, &params, gate_mm, &polarity, &mut edges);
@@ -404,7 +438,7 @@ impl Problem<'_> {
         normal: &mut Normal,
     ) -> f64 {
         let (mut squares, mut count) = (0.0, 0);
-        for view in views {
+        for view in views.iter().step_by(self.view_stride) {
             let outline = self.outline(view, params);
             let reach = &view.reach_mm[self.silhouette as usize];
             for (k, &reach) in reach.iter().enumerate().filter(|(_, r)| r.is_finite()) {
@@ -433,7 +467,7 @@ impl Problem<'_> {
     ) -> EdgeUse {
         let mut used = EdgeUse::default();
         let sigma_mm = EDGE_SIGMA_PX * self.geometry.mm_per_px;
-        for view in views.iter().filter(|v| !v.samples().is_empty()) {
+        for view in self.sampled(views) {
             let outline = self.outline(view, params);
             let trust: [[f64; 2]; EDGES] =
                 std::array::from_fn(|e| self.trust(&outline, EdgeId(e as u8)));

@@ -31,7 +31,7 @@ impl Problem<'_> {
         let mut votes = [[[0.0f64; VOTE_BINS]; 2]; 4];
         let mut depth = [(0.0, 0u32); 4];
         let mut sampled = 0;
-        for view in views.iter().filter(|v| !v.samples().is_empty()) {
+        for view in self.sampled(views) {
             let outline = self.outline(view, params);
             sampled += 1;
             for (k, (sum, count)) in depth.iter_mut().enumerate() {
