@@ -11,7 +11,7 @@ use super::model::{
     YAW, canonical, direction,
 };
 use super::observe::{EdgeSample, PassView};
-use super::votes::FaceVote;
+use super::votes::{FaceVote, RISING_TRUST, SLOPE_ENOUGH, choose};
 use crate::camera::BeltView;
 use crate::units::BeltRect;
 use nalgebra::{SMatrix, SVector, Vector2};
@@ -39,11 +39,6 @@ const NARROW_SIDE_TRUST: f64 = 0.05;
 /// A step from a dark parcel's top straight to a brighter belt may be the border of its contact
 /// shadow: it counts this much.
 const SHADOW_TRUST: f64 = 0.2;
-/// Light comes from above: a visible side is rarely brighter than the top, and a rising step
-/// there is rather that from a dark side to the belt.
-const RISING_TRUST: f64 = 0.5;
-/// Steeper than this, grey levels a px, is no better: a label must not outdo a dark edge.
-const SLOPE_ENOUGH: f32 = 3.0;
 /// Views that are enough to choose the right start.
 const SEARCH_VIEWS: usize = 20;
 /// A mean square silhouette residual that costs half of a fit's contrast. Shadows alone make 10
@@ -184,6 +179,11 @@ impl Problem<'_> {
         Outline::rounded(self.geometry, self.rounding, params, travel_mm)
     }
 
+    /// The same on as many views as are enough to choose a start.
+    fn search(&self, views: &[PassView]) -> Self {
+        Self { view_stride: (views.len() / SEARCH_VIEWS).max(1), ..*self }
+    }
+
     /// The views with profiles.
     pub(super) fn sampled<'v>(&self, views: &'v [PassView]) -> impl Iterator<Item = &'v PassView> {
         views.iter().filter(|v| !v.samples().is_empty()).step_by(self.view_stride)
@@ -195,14 +195,15 @@ impl Problem<'_> {
             Some(params) => [Some(params), None, None],
             None => [0.1, 0.35, 0.75].map(|share| self.start(views, share * self.height_max_mm)),
         };
+        let search = self.search(views);
         let mut best: Option<(f64, Params)> = None;
         for candidate in candidates.into_iter().flatten() {
-            let (cost, params) = self.descend(views, candidate, 8);
+            let (cost, params) = search.descend(views, candidate, 8);
             if cost.is_finite() && best.is_none_or(|(c, _)| cost < c) {
                 best = Some((cost, params));
             }
         }
-        let (_, params) = best?;
+        let (_, params) = self.descend(views, best?.1, 4);
         let (normal, reach_error) = self.reach_normal(views, &params);
         self.estimate(params, &normal, reach_error, &EdgeUse::default())
     }
@@ -221,9 +222,8 @@ impl Problem<'_> {
     /// Fit edges, starting from an estimate of the silhouettes: the best of several starts, tried
     /// on some of the views, then on all of them.
     pub fn fit_edges(&self, views: &[PassView], start: Params) -> Option<Estimate> {
-        let view_stride = (views.len() / SEARCH_VIEWS).max(1);
-        let search = Self { view_stride, ..*self };
-        let start = search.search_edges(views, start, &self.face_votes(views, &start))?.params;
+        let found = self.face_votes(views, &start);
+        let start = self.search(views).search_edges(views, start, &found)?.params;
         self.refine_edges(views, start, &GATES_PX[NEAR_GATE..])
     }
 
@@ -542,31 +542,6 @@ impl Problem<'_> {
     }
 }
 
-/// The step that belongs to the predicted edge: inside the gate, of the edge's polarity once
-/// that is known, the strongest for its distance. Returns residual and slope.
-fn choose(
-    sample: &EdgeSample,
-    predicted_mm: f64,
-    gate_mm: f64,
-    polarity: f64,
-    rising: f64,
-) -> Option<(f64, f32)> {
-    let mut best: Option<(f64, f64, f32)> = None;
-    for step in sample.steps.iter().filter(|s| s.slope != 0.0) {
-        let residual = f64::from(step.at) - predicted_mm;
-        let near = 1.0 - (residual / gate_mm).powi(2);
-        if near <= 0.0 || f64::from(step.slope) * polarity < 0.0 {
-            continue;
-        }
-        let sign = if step.slope > 0.0 { rising } else { 1.0 };
-        let score = f64::from(step.slope.abs().min(SLOPE_ENOUGH)) * near * sign;
-        if best.is_none_or(|(s, _, _)| score > s) {
-            best = Some((score, residual, step.slope));
-        }
-    }
-    best.map(|(_, residual, slope)| (residual, slope))
-}
-
 /// An estimate's parameters with length >= width, and the sigmas in the same order.
 pub fn canonical_estimate(mut estimate: Estimate) -> Estimate {
     if estimate.params[LENGTH] < estimate.params[WIDTH] {
@@ -574,33 +549,4 @@ pub fn canonical_estimate(mut estimate: Estimate) -> Estimate {
     }
     estimate.params = canonical(estimate.params);
     estimate
-}
-
-#[cfg(test)]
-mod tests {
-    use super::*;
-    use crate::kernel::scalar::profile::Step;
-
-    fn sample(steps: [(f32, f32); 2]) -> EdgeSample {
-        let mut sample = EdgeSample::EMPTY;
-        for (kept, (at, slope)) in sample.steps.iter_mut().zip(steps) {
-            *kept = Step { at, slope };
-        }
-        sample
-    }
-
-    #[test]
-    fn a_label_further_away_does_not_outdo_a_dark_edge() {
-        let chosen = choose(&sample([(0.5, -4.0), (-4.0, -60.0)]), 0.0, 6.0, 0.0, 1.0);
-        assert_eq!(chosen, Some((0.5, -4.0)));
-    }
-
-    #[test]
-    fn above_a_visible_side_the_falling_edge_is_the_top_one() {
-        let steps = sample([(1.0, 3.0), (-1.0, -3.0)]);
-        let chosen = choose(&steps, 0.2, 6.0, 0.0, RISING_TRUST);
-        assert_eq!(chosen.map(|c| c.1), Some(-3.0));
-        // Where rising edges are as likely, the nearer one is taken.
-        assert_eq!(choose(&steps, 0.2, 6.0, 0.0, 1.0).map(|c| c.1), Some(3.0));
-    }
 }

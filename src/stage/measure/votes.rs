@@ -1,9 +1,9 @@
-//! Votes of all profiles of a pass on where each face's top edge is: what brings the fit near
-//! enough to choose the right steps.
+//! Which steps of the profiles are the cuboid's edges: votes of a whole pass on where each face's
+//! top edge is, and the choice of one step near a predicted edge.
 
 use super::fit::{Problem, SIDE_DEPTH_MIN_PX};
 use super::model::{HEIGHT, LENGTH, Params, WIDTH};
-use super::observe::PassView;
+use super::observe::{EdgeSample, PassView};
 
 /// Votes on where a face's top edge is, relative to the silhouette's: bins of half a pixel,
 /// from well inside (shadows and dark sides widen a silhouette) to a little outside.
@@ -16,6 +16,12 @@ const VOTE_SLOPE_MAX: f32 = 1.5;
 const VOTE_SHARE: f64 = 0.85;
 /// No edge of a face is further inside the silhouette than this share of the parcel.
 const INSIDE_MAX: f64 = 0.3;
+
+/// Light comes from above: a visible side is rarely brighter than the top, and a rising step
+/// there is rather that from a dark side to the belt.
+pub(super) const RISING_TRUST: f64 = 0.5;
+/// Steeper than this, grey levels a px, is no better: a label must not outdo a dark edge.
+pub(super) const SLOPE_ENOUGH: f32 = 3.0;
 
 /// What the profiles say about a face.
 pub struct FaceVote {
@@ -91,9 +97,35 @@ fn outermost_peak(votes: &[[f64; VOTE_BINS]; 2], first_px: f64) -> Option<f64> {
     Some(VOTE_FIRST_PX + (peak as f64 + 0.5) * VOTE_BIN_PX)
 }
 
+/// The step that belongs to the predicted edge: inside the gate, of the edge's polarity once
+/// that is known, the strongest for its distance. Returns residual and slope.
+pub(super) fn choose(
+    sample: &EdgeSample,
+    predicted_mm: f64,
+    gate_mm: f64,
+    polarity: f64,
+    rising: f64,
+) -> Option<(f64, f32)> {
+    let mut best: Option<(f64, f64, f32)> = None;
+    for step in sample.steps.iter().filter(|s| s.slope != 0.0) {
+        let residual = f64::from(step.at) - predicted_mm;
+        let near = 1.0 - (residual / gate_mm).powi(2);
+        if near <= 0.0 || f64::from(step.slope) * polarity < 0.0 {
+            continue;
+        }
+        let sign = if step.slope > 0.0 { rising } else { 1.0 };
+        let score = f64::from(step.slope.abs().min(SLOPE_ENOUGH)) * near * sign;
+        if best.is_none_or(|(s, _, _)| score > s) {
+            best = Some((score, residual, step.slope));
+        }
+    }
+    best.map(|(_, residual, slope)| (residual, slope))
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::kernel::scalar::profile::Step;
 
     fn votes(places: &[(f64, f64)]) -> [f64; VOTE_BINS] {
         let mut votes = [0.0; VOTE_BINS];
@@ -119,5 +151,28 @@ mod tests {
         let visible = votes(&[(-1.0, -60.0)]);
         let found = outermost_peak(&[hidden, visible], -30.0).expect("votes");
         assert!((found + 1.0).abs() <= 1.0, "{found}");
+    }
+
+    fn sample(steps: [(f32, f32); 2]) -> EdgeSample {
+        let mut sample = EdgeSample::EMPTY;
+        for (kept, (at, slope)) in sample.steps.iter_mut().zip(steps) {
+            *kept = Step { at, slope };
+        }
+        sample
+    }
+
+    #[test]
+    fn a_label_further_away_does_not_outdo_a_dark_edge() {
+        let chosen = choose(&sample([(0.5, -4.0), (-4.0, -60.0)]), 0.0, 6.0, 0.0, 1.0);
+        assert_eq!(chosen, Some((0.5, -4.0)));
+    }
+
+    #[test]
+    fn above_a_visible_side_the_falling_edge_is_the_top_one() {
+        let steps = sample([(1.0, 3.0), (-1.0, -3.0)]);
+        let chosen = choose(&steps, 0.2, 6.0, 0.0, RISING_TRUST);
+        assert_eq!(chosen.map(|c| c.1), Some(-3.0));
+        // Where rising edges are as likely, the nearer one is taken.
+        assert_eq!(choose(&steps, 0.2, 6.0, 0.0, 1.0).map(|c| c.1), Some(3.0));
     }
 }
