@@ -339,8 +339,11 @@ impl Solid {
     /// Where a ray meets the solid as if its edges were sharp.
     fn meet(&self, camera: [f32; 3], ground: [f32; 2], shift_mm: f32) -> Option<Hit> {
         let ray = self.cross(camera, ground, shift_mm)?;
-        let [a, b, z] = ray.at(ray.enter);
-        Some(if ray.face == 0 { self.top([a, b]) } else { self.side(ray.face, z) })
+        Some(self.shade_sharp(&ray, ray.at(ray.enter)))
+    }
+
+    fn shade_sharp(&self, ray: &Crossing, [a, b, z]: [f32; 3]) -> Hit {
+        if ray.face == 0 { self.top([a, b]) } else { self.side(ray.face, z) }
     }
 
     /// Grey level where a ray meets the solid with its rounded edges: sphere tracing (Hart 1996)
@@ -350,8 +353,13 @@ impl Solid {
         const NEAR_MM: f32 = 0.02;
         const STEPS: usize = 16;
         let ray = self.cross(camera, ground, shift_mm)?;
+        let [a, b, z] = ray.at(ray.enter);
+        let core = |k: usize, at: f32| at.abs() <= self.half[k] - self.radius;
+        if ray.face == 0 && core(0, a) && core(1, b) {
+            return Some(self.top([a, b]).grey);
+        }
         if self.radius == 0.0 {
-            return self.meet(camera, ground, shift_mm).map(|hit| hit.grey);
+            return Some(self.shade_sharp(&ray, [a, b, z]).grey);
         }
         let length = ray.along.iter().map(|a| a * a).sum::<f32>().sqrt();
         let mut s = ray.enter;
