@@ -51,6 +51,16 @@ impl<'a> Plane<'a> {
         &self.data[y * self.stride..][..self.width]
     }
 
+    /// Bytes from one row to the next.
+    pub fn stride(&self) -> usize {
+        self.stride
+    }
+
+    /// All bytes from column `x`, row `y` on, those between the rows included.
+    pub fn from(&self, x: usize, y: usize) -> &'a [u8] {
+        &self.data[y * self.stride + x..]
+    }
+
     /// Value at column `x`, row `y`.
     pub fn at(&self, x: usize, y: usize) -> u8 {
         self.row(y)[x]

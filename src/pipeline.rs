@@ -9,7 +9,8 @@ use crate::config::Site;
 use crate::error::{Error, Result};
 use crate::event::{Counters, Flags, ParcelRecord, Shape};
 use crate::image::{FrameTime, Plane};
-use crate::kernel::scalar::bits::{self, dilate3x3, words};
+use crate::kernel::Level;
+use crate::kernel::scalar::bits::{self, dilate, words};
 use crate::plan::{Block, Memory, Plan};
 use crate::stage::background::Background;
 use crate::stage::measure::{self, Frame, Measure, Measured};
@@ -89,13 +90,15 @@ impl Pipeline {
         let start = FrameTime { index: 0, t_s: 0.0 };
         let nowhere =
             Reference { began_s: 0.0, time: start, at: BeltPosition::default(), fixed: false };
-        let rectify = Rectify::new(&site.camera, view, memory)?;
-        let background = Background::new(view.size_px, config.background.clone(), memory)?;
+        let level = Level::new();
+        let rectify = Rectify::new(&site.camera, view, level, memory)?;
+        let background = Background::new(view.size_px, config.background.clone(), level, memory)?;
         let odometry = Odometry::new(
             view,
             &zone,
             config.belt.speed_mm_per_s,
             config.odometry.speed_error_max,
+            level,
             memory,
         )?;
         let segment = Segment::new(view.size_px, view.mm_per_px, config.segment.clone(), memory)?;
@@ -142,13 +145,14 @@ impl Pipeline {
 
         self.rectify.step(raw);
         self.hold_background();
-        self.background.step(self.rectify.view(), self.rectify.seen(), &self.hold);
+        self.background.step(self.rectify.pixels(), self.rectify.seen(), &self.hold);
         if !self.background.learned() {
             return Ok(());
         }
         self.segment.step(self.background.foreground(), self.background.strong());
         self.cover();
-        let motion = self.odometry.step(self.rectify.view(), &self.background, &self.covered, dt_s);
+        let motion =
+            self.odometry.step(self.rectify.pixels(), &self.background, &self.covered, dt_s);
         self.at.advance(motion.step_mm, motion.measured);
         self.track(motion.step_mm);
         self.measure_tracks(time);
@@ -185,14 +189,17 @@ impl Pipeline {
                 bits::set(&mut self.hold[usize::from(run.v) * n..][..n], run.start, run.end);
             }
         }
-        widen(&mut self.hold, &mut self.scratch, width, HOLD_MARGIN_PX);
+        dilate(&mut self.hold, &mut self.scratch, width, HOLD_MARGIN_PX);
+        for (hold, seen) in self.hold.iter_mut().zip(self.rectify.seen()) {
+            *hold |= !seen;
+        }
     }
 
     /// What is not free belt: every blob with its surroundings.
     fn cover(&mut self) {
         self.covered.copy_from_slice(self.segment.mask());
         let width = self.site.view.size_px[0];
-        widen(&mut self.covered, &mut self.scratch, width, COVER_MARGIN_PX);
+        dilate(&mut self.covered, &mut self.scratch, width, COVER_MARGIN_PX);
         for (covered, seen) in self.covered.iter_mut().zip(self.rectify.seen()) {
             *covered |= !seen;
         }
@@ -389,13 +396,5 @@ impl Pipeline {
     /// The site it was built for.
     pub fn site(&self) -> &Site {
         &self.site
-    }
-}
-
-/// Dilate a mask of rows of `width` pixels.
-fn widen(mask: &mut Block<u64>, scratch: &mut Block<u64>, width: usize, times: usize) {
-    for _ in 0..times {
-        dilate3x3(mask, scratch, width);
-        std::mem::swap(mask, scratch);
     }
 }

@@ -1,6 +1,9 @@
 //! Hardware in the loop without hardware: the real binary, and peers that the project did not
 //! write. Here is what its tests share; the tests are in `hil/tests`.
 
+pub mod opencv_chain;
+pub mod scene;
+
 use std::net::{SocketAddr, TcpListener, TcpStream};
 use std::path::{Path, PathBuf};
 use std::process::{Child, Command, Stdio};

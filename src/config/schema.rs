@@ -249,7 +249,7 @@ impl Config {
         }
         count("background.learn_frames", background.learn_frames as usize, 1, 1000)?;
         count("background.history_frames", background.history_frames as usize, 20, 2000)?;
-        range("background.threshold_sigma", background.threshold_sigma, 1.0, 10.0, "")?;
+        range("background.threshold_sigma", background.threshold_sigma, 3.0, 10.0, "")?;
         range("background.shadow_ratio_min", background.shadow_ratio_min, 0.1, 1.0, "")?;
         let deep = background.deep_shadow_ratio_min;
         range("background.deep_shadow_ratio_min", deep, 0.0, 1.0, "")?;

@@ -8,169 +8,200 @@
 
 use crate::config::Background as Settings;
 use crate::error::Result;
-use crate::image::Plane;
-use crate::kernel::scalar::bits::words;
-use crate::kernel::scalar::mixture::{MODES, ModeRow, Params, observation, update};
+
+use crate::kernel::Level;
+use crate::kernel::scalar::bits::{stride, words};
+use crate::kernel::scalar::mixture::{
+    Gain, MATCH_Q8, MINORS, Params, Rate, VARIANCE_NEW, observation,
+};
+use crate::kernel::simd::mixture::{Masks, Minors, Model, update};
 use crate::plan::{Block, Memory, Plan};
 
-/// Gain 1 in Q12.
-const GAIN_ONE: u32 = 1 << 12;
-/// Every so many pixels and rows one pixel votes on the gain.
-const GAIN_GRID_PX: usize = 6;
-/// Pixels darker than this say little about the gain: 10 grey levels, Q8.
-const GAIN_MEAN_MIN: u16 = 10 << 8;
+/// Gain 1 in Q15.
+const GAIN_ONE: u32 = 1 << 15;
+/// So many pixels, evenly spread, vote on the gain.
+const GAIN_VOTES: usize = 8000;
+/// Pixels darker than this say little about the gain: 10 grey levels, Q7.
+const GAIN_MEAN_MIN: u16 = 10 << 7;
 /// Brightness ratios are counted in bins of 1/128, up to 4.
 const GAIN_BINS: usize = 512;
 const GAIN_BIN_ONE: u32 = 128;
 /// The mean is taken over ratios this near to the median.
 const GAIN_BINS_NEAR: usize = 8;
+/// Modes that together hold nine tenths of the observations are background, 1/255.
+const BACKGROUND_SHARE: u8 = 229;
 
-const MODE_BLOCKS: [[&str; 3]; MODES] = [
-    ["background.weight_0", "background.mean_0", "background.variance_0"],
-    ["background.weight_1", "background.mean_1", "background.variance_1"],
-    ["background.weight_2", "background.mean_2", "background.variance_2"],
+const MINOR_BLOCKS: [[&str; 3]; MINORS] = [
+    ["background.mean_1", "background.variance_1", "background.weight_1"],
+    ["background.mean_2", "background.variance_2", "background.weight_2"],
 ];
 
-struct Mode {
-    weight: Block<u16>,
+/// A weaker mode of every pixel.
+struct Minor {
     mean: Block<u16>,
-    variance: Block<u16>,
+    variance: Block<u8>,
+    weight: Block<u8>,
 }
 
 /// The background stage.
 pub struct Background {
+    level: Level,
     width: usize,
     settings: Settings,
-    modes: [Mode; MODES],
+    mean: Block<u16>,
+    variance: Block<u16>,
+    minors: [Minor; MINORS],
+    multiple: Block<u64>,
     foreground: Block<u64>,
     dark: Block<u64>,
     strong: Block<u64>,
     gain_histogram: Block<u32>,
-    /// Model brightness over scene brightness, Q12.
-    gain_q12: u32,
+    gain_step_px: usize,
+    /// Model brightness over scene brightness, Q15.
+    gain_q15: u32,
     frames: u32,
 }
 
 impl Background {
     /// Memory for a view.
     pub fn plan([width, height]: [usize; 2], plan: &mut Plan) {
-        for name in MODE_BLOCKS.iter().flatten() {
-            plan.add::<u16>(name, width * height, "mixture model, one plane a mode and value");
+        let (pixels, words) = (stride(width) * height, words(width) * height);
+        plan.add::<u16>("background.mean", pixels, "mixture model, the main mode of each pixel");
+        plan.add::<u16>("background.variance", pixels, "mixture model, the main mode");
+        for [mean, variance, weight] in MINOR_BLOCKS {
+            plan.add::<u16>(mean, pixels, "mixture model, a weaker mode; seldom touched");
+            plan.add::<u8>(variance, pixels, "mixture model, a weaker mode");
+            plan.add::<u8>(weight, pixels, "mixture model, a weaker mode");
         }
-        plan.add::<u64>("background.foreground", words(width) * height, "bit: foreground");
-        plan.add::<u64>("background.dark", words(width) * height, "bit: foreground or deep shadow");
-        plan.add::<u64>("background.strong", words(width) * height, "bit: far from the background");
+        plan.add::<u64>("background.multiple", words, "bit: the pixel has a weaker mode");
+        plan.add::<u64>("background.foreground", words, "bit: foreground");
+        plan.add::<u64>("background.dark", words, "bit: foreground or deep shadow");
+        plan.add::<u64>("background.strong", words, "bit: far from the background");
         plan.add::<u32>("background.gain", GAIN_BINS, "histogram of brightness ratios");
     }
 
     /// An empty model.
-    pub fn new([width, _]: [usize; 2], settings: Settings, memory: &mut Memory) -> Result<Self> {
-        let mut mode = |names: [&'static str; 3]| -> Result<Mode> {
-            Ok(Mode {
-                weight: memory.take(names[0], 0)?,
-                mean: memory.take(names[1], 0)?,
-                variance: memory.take(names[2], 0)?,
+    pub fn new(
+        [width, height]: [usize; 2],
+        settings: Settings,
+        level: Level,
+        memory: &mut Memory,
+    ) -> Result<Self> {
+        let mean = memory.take("background.mean", 0)?;
+        let variance = memory.take("background.variance", VARIANCE_NEW)?;
+        let mut minor = |[mean, variance, weight]: [&'static str; 3]| -> Result<Minor> {
+            Ok(Minor {
+                mean: memory.take(mean, 0)?,
+                variance: memory.take(variance, 0)?,
+                weight: memory.take(weight, 0)?,
             })
         };
-        let modes = [mode(MODE_BLOCKS[0])?, mode(MODE_BLOCKS[1])?, mode(MODE_BLOCKS[2])?];
+        let minors = [minor(MINOR_BLOCKS[0])?, minor(MINOR_BLOCKS[1])?];
         Ok(Self {
+            level,
             width,
             settings,
-            modes,
+            mean,
+            variance,
+            minors,
+            multiple: memory.take("background.multiple", 0)?,
             foreground: memory.take("background.foreground", 0)?,
             dark: memory.take("background.dark", 0)?,
             strong: memory.take("background.strong", 0)?,
             gain_histogram: memory.take("background.gain", 0)?,
-            gain_q12: GAIN_ONE,
+            gain_step_px: (width * height / GAIN_VOTES).isqrt().max(1),
+            gain_q15: GAIN_ONE,
             frames: 0,
         })
     }
 
-    /// Classify and learn one frame. `seen` and `hold` are bit masks of the view.
-    pub fn step(&mut self, view: Plane<'_>, seen: &[u64], hold: &[u64]) {
-        if self.frames > 0 {
-            self.gain_q12 = self.estimate_gain(view, seen);
+    /// Classify and learn one frame: `grey`, rows of [`stride`] pixels. `hold`: bit mask of the
+    /// pixels not to learn.
+    pub fn step(&mut self, grey: &[u8], seen: &[u64], hold: &[u64]) {
+        if self.frames == 0 {
+            for (mean, &grey) in self.mean.iter_mut().zip(grey) {
+                *mean = observation(grey, Gain::ONE);
+            }
+        } else {
+            self.gain_q15 = self.estimate_gain(grey, seen);
         }
         self.frames = self.frames.saturating_add(1);
         let params = self.params();
-        let n = words(self.width);
-        for v in 0..view.height() {
-            let row = view.row(v);
-            for (w, grey) in row.chunks(64).enumerate() {
-                let word = v * n + w;
-                let pixels = v * self.width + w * 64..v * self.width + w * 64 + grey.len();
-                let mut modes = self.modes.each_mut().map(|m| ModeRow {
-                    weight: &mut m.weight[pixels.clone()],
-                    mean: &mut m.mean[pixels.clone()],
-                    variance: &mut m.variance[pixels.clone()],
-                });
-                let hold = hold[word] | !seen[word];
-                let masks = update(grey, &mut modes, hold, &params);
-                self.foreground[word] = masks.foreground & seen[word];
-                self.dark[word] = masks.dark & seen[word];
-                self.strong[word] = masks.strong & seen[word];
+        let mut model = Model {
+            mean: &mut self.mean,
+            variance: &mut self.variance,
+            minors: self.minors.each_mut().map(|m| Minors {
+                mean: &mut m.mean,
+                variance: &mut m.variance,
+                weight: &mut m.weight,
+            }),
+            multiple: &mut self.multiple,
+        };
+        let mut masks = Masks {
+            foreground: &mut self.foreground,
+            dark: &mut self.dark,
+            strong: &mut self.strong,
+        };
+        update(self.level, grey, &mut model, hold, &mut masks, &params);
+        for mask in [masks.foreground, masks.dark, masks.strong] {
+            for (bits, seen) in mask.iter_mut().zip(seen) {
+                *bits &= seen;
             }
         }
     }
 
     fn params(&self) -> Params {
-        let sigma = self.settings.threshold_sigma;
-        let history = self.frames.min(self.settings.history_frames);
+        let ratio_q8 = |ratio: f64| ((ratio * 256.0) as u16).min(255);
         Params {
-            rate_q16: 65536 / history,
-            gain_q12: self.gain_q12,
-            match_d2_q8: 9 << 8, // 3 sigma, as in Zivkovic 2004
-            background_d2_q8: (sigma * sigma * 256.0) as u32,
-            background_share_q16: 58982, // 0.9
-            shadow_ratio_q8: (self.settings.shadow_ratio_min * 256.0) as u32,
-            dark_ratio_q8: (self.settings.deep_shadow_ratio_min * 256.0) as u32,
+            rate: Rate::new(self.frames.min(self.settings.history_frames), self.frames),
+            gain: Gain::from_q15(self.gain_q15),
+            reach_q8: ((256.0 / self.settings.threshold_sigma) as u16).min(MATCH_Q8),
+            background_share: BACKGROUND_SHARE,
+            shadow_ratio_q8: ratio_q8(self.settings.shadow_ratio_min),
+            dark_ratio_q8: ratio_q8(self.settings.deep_shadow_ratio_min),
         }
     }
 
     /// Model over scene brightness: the median of scene over model on the grid finds the belt,
     /// the mean of the ratios near it is the gain. What was foreground does not vote.
-    fn estimate_gain(&mut self, view: Plane<'_>, seen: &[u64]) -> u32 {
-        let (n, width) = (words(self.width), self.width);
-        let mean = &self.modes[0].mean;
-        let foreground = &self.foreground;
-        let grid = |v: usize| {
-            let row = view.row(v);
-            (0..width).step_by(GAIN_GRID_PX).filter_map(move |u| {
-                let model = mean[v * width + u];
-                let is_belt = seen[v * n + u / 64] & !foreground[v * n + u / 64];
-                let visible = is_belt >> (u % 64) & 1 == 1;
-                let bin = u32::from(row[u]) * 256 * GAIN_BIN_ONE / u32::from(model.max(1));
-                (visible && model >= GAIN_MEAN_MIN).then_some((
-                    row[u],
-                    model,
-                    (bin as usize).min(GAIN_BINS - 1),
-                ))
+    fn estimate_gain(&mut self, grey: &[u8], seen: &[u64]) -> u32 {
+        let (n, stride, step) = (words(self.width), stride(self.width), self.gain_step_px);
+        let (mean, foreground, width) = (&self.mean, &self.foreground, self.width);
+        let votes = || {
+            let rows = (0..mean.len() / stride).step_by(step);
+            let places = rows.flat_map(|v| (0..width).step_by(step).map(move |u| (u, v)));
+            places.filter_map(|(u, v)| {
+                let (grey, model) = (grey[v * stride + u], mean[v * stride + u]);
+                let word = v * n + u / 64;
+                let is_belt = (seen[word] & !foreground[word]) >> (u % 64) & 1 == 1;
+                let bin = u32::from(grey) * 128 * GAIN_BIN_ONE / u32::from(model.max(1));
+                let bin = (bin as usize).min(GAIN_BINS - 1);
+                (is_belt && model >= GAIN_MEAN_MIN).then_some((grey, model, bin))
             })
         };
-        let rows = || (0..view.height()).step_by(GAIN_GRID_PX);
         let histogram = &mut self.gain_histogram;
         histogram.fill(0);
-        let mut votes = 0;
-        for (_, _, bin) in rows().flat_map(grid) {
+        let mut count = 0;
+        for (_, _, bin) in votes() {
             histogram[bin] += 1;
-            votes += 1;
+            count += 1;
         }
         let mut below = 0;
-        let median = histogram.iter().position(|&count| {
-            below += count;
-            below * 2 > votes
+        let median = histogram.iter().position(|&votes| {
+            below += votes;
+            below * 2 > count
         });
-        let Some(median) = median else { return self.gain_q12 };
+        let Some(median) = median else { return self.gain_q15 };
         let (mut scene, mut model) = (0u64, 0u64);
-        for (grey, mean, bin) in rows().flat_map(grid) {
+        for (grey, mean, bin) in votes() {
             if bin.abs_diff(median) <= GAIN_BINS_NEAR {
                 scene += u64::from(grey);
                 model += u64::from(mean);
             }
         }
-        // Both sums are over the same pixels; the model is in Q8.
-        let gain = model * u64::from(GAIN_ONE) / (scene * 256).max(1);
-        (gain as u32).clamp(GAIN_ONE / 4, GAIN_ONE * 4)
+        // Both sums are over the same pixels; the model is in Q7.
+        let gain = model * u64::from(GAIN_ONE) / (scene * 128).max(1);
+        gain.clamp(u64::from(GAIN_ONE / 4), 65535) as u32
     }
 
     /// Whether the model has seen enough frames to be trusted.
@@ -193,8 +224,9 @@ impl Background {
         &self.strong
     }
 
-    /// A pixel's difference from the belt's mean, in Q8 grey levels at model brightness.
-    pub fn difference(&self, grey: u8, index: usize) -> i32 {
-        i32::from(observation(grey, self.gain_q12)) - i32::from(self.modes[0].mean[index])
+    /// The belt's mean, Q7, row by row of [`stride`] pixels, and the light of this frame: what a
+    /// grey level is to be compared with.
+    pub fn belt(&self) -> (&[u16], Gain) {
+        (&self.mean, Gain::from_q15(self.gain_q15))
     }
 }

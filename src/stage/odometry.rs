@@ -5,32 +5,29 @@
 //! The current texture is matched with the key's, not with the last frame's, so errors do
 //! not add up frame by frame; a new key is taken when the overlap gets small. In the belt
 //! view all belt motion is horizontal, so a match is one number.
-//! Cost: one product a pixel of every second zone row for each shift tried, 13 when locked.
+//! Cost: at most 250,000 pixels taken out, and as many products for each shift tried, 13 when locked.
 //! Source: normalised cross-correlation; its peak by Lanczos interpolation, because a parabola
 //! through three shifts is off by 0.05 px, always towards the same side at the same speed.
 
 use crate::camera::BeltView;
 use crate::error::Result;
-use crate::image::Plane;
-use crate::kernel::scalar::bits;
-use crate::kernel::scalar::correlate::{NO_TEXTURE, Sums, correlate};
+use crate::kernel::Level;
+use crate::kernel::scalar::bits::{self, stride};
+use crate::kernel::scalar::texture::{NO_TEXTURE, SUMS_BORDER, Sums};
+use crate::kernel::simd::texture::{correlate, extract};
 use crate::plan::{Block, Memory, Plan};
 use crate::stage::background::Background;
 use crate::units::{BeltMm, BeltRect};
 
-/// Every second row carries the texture; neighbouring rows repeat most of it.
-const ROW_STEP: usize = 2;
-/// Texture is stored in 1/16 grey level: a shift of Q8.
-const TEXTURE_SHIFT: u32 = 4;
-/// Differences beyond 7 grey levels are shadows, dirt or parcels, not texture.
-const TEXTURE_MAX: i32 = 112;
+/// At least every second row carries the texture: neighbouring rows repeat most of it ...
+const ROW_STEP_MIN: usize = 2;
+/// ... and so many pixels are enough: more cost time and tell next to nothing.
+const TEXTURE_PX: usize = 250_000;
 /// When locked, shifts this far around the prediction are tried.
 const LOCKED_SEARCH_PX: f64 = 1.5;
 /// The peak is interpolated from this many shifts to both sides.
 const PEAK_HALF: isize = 4;
 const PEAK_SHIFTS: usize = 2 * PEAK_HALF as usize + 1;
-/// Half width of the window whose mean is taken out of the texture.
-const SHADING_PX: usize = 16;
 /// A correlation above this is a match: 200 x 800 px of pure noise stay below 0.02.
 const MATCH_MIN: f64 = 0.08;
 /// Pairs of textured pixels below which a match proves nothing.
@@ -56,17 +53,20 @@ pub struct Motion {
 
 /// The odometry stage.
 pub struct Odometry {
+    level: Level,
     mm_per_px: f64,
     width: usize,
     /// First and one-past-last column and row of the zone.
     columns: std::ops::Range<usize>,
     rows: std::ops::Range<usize>,
+    row_step: usize,
     nominal_mm_per_s: f64,
     speed_error_max: f64,
     /// Last known speed.
     speed_mm_per_s: f64,
     key: Block<i8>,
     current: Block<i8>,
+    sums: Block<i32>,
     /// Travel from the key to the last frame, px; `None` before the first key.
     shift_px: Option<f64>,
     locked: bool,
@@ -89,16 +89,23 @@ impl Odometry {
         [range(a.u, b.u, view.size_px[0]), range(a.v, b.v, view.size_px[1])]
     }
 
-    fn texture_px(view: &BeltView, zone: &BeltRect) -> usize {
-        let [columns, rows] = Self::zone_px(view, zone);
-        columns.len() * rows.len().div_ceil(ROW_STEP)
+    /// Columns of the texture: those of the zone, in whole blocks of 64.
+    fn blocks(columns: &std::ops::Range<usize>) -> std::ops::Range<usize> {
+        columns.start / 64 * 64..columns.end.next_multiple_of(64)
+    }
+
+    fn row_step([columns, rows]: &[std::ops::Range<usize>; 2]) -> usize {
+        (columns.len() * rows.len()).div_ceil(TEXTURE_PX).max(ROW_STEP_MIN)
     }
 
     /// Memory for a zone.
     pub fn plan(view: &BeltView, zone: &BeltRect, plan: &mut Plan) {
-        let n = Self::texture_px(view, zone);
-        plan.add::<i8>("odometry.key", n, "belt texture of the key frame, every second row");
+        let zone = Self::zone_px(view, zone);
+        let row = Self::blocks(&zone[0]).len();
+        let n = row * zone[1].len().div_ceil(Self::row_step(&zone));
+        plan.add::<i8>("odometry.key", n, "belt texture of the key frame, some of the rows");
         plan.add::<i8>("odometry.current", n, "belt texture of the current frame");
+        plan.add::<i32>("odometry.sums", row + SUMS_BORDER, "running sums of a row");
     }
 
     /// Not yet locked.
@@ -107,10 +114,15 @@ impl Odometry {
         zone: &BeltRect,
         nominal_mm_per_s: f64,
         speed_error_max: f64,
+        level: Level,
         memory: &mut Memory,
     ) -> Result<Self> {
-        let [columns, rows] = Self::zone_px(view, zone);
+        let zone = Self::zone_px(view, zone);
+        let row_step = Self::row_step(&zone);
+        let [columns, rows] = zone;
         Ok(Self {
+            level,
+            row_step,
             mm_per_px: view.mm_per_px,
             width: view.size_px[0],
             columns,
@@ -120,21 +132,23 @@ impl Odometry {
             speed_mm_per_s: nominal_mm_per_s,
             key: memory.take("odometry.key", NO_TEXTURE)?,
             current: memory.take("odometry.current", NO_TEXTURE)?,
+            sums: memory.take("odometry.sums", 0)?,
             shift_px: None,
             locked: false,
             misses: 0,
         })
     }
 
-    /// One frame, `dt_s` after the last one. `covered`: bit mask of pixels that are not belt.
+    /// One frame, `dt_s` after the last one: `grey`, rows of [`stride`] pixels. `covered`: bit mask
+    /// of pixels that are not belt.
     pub fn step(
         &mut self,
-        view: Plane<'_>,
+        grey: &[u8],
         background: &Background,
         covered: &[u64],
         dt_s: f64,
     ) -> Motion {
-        self.extract(view, background, covered);
+        self.extract(grey, background, covered);
         let Some(last_px) = self.shift_px else {
             self.take_key();
             return Motion { step_mm: self.speed_mm_per_s * dt_s, measured: false };
@@ -183,19 +197,18 @@ impl Odometry {
     }
 
     /// Belt texture of the zone: the view minus the background, where it is belt.
-    fn extract(&mut self, view: Plane<'_>, background: &Background, covered: &[u64]) {
-        let words = bits::words(self.width);
-        let columns = self.columns.clone();
-        let rows = self.rows.clone().step_by(ROW_STEP);
-        for (v, out) in rows.zip(self.current.chunks_exact_mut(columns.len())) {
-            let grey = &view.row(v)[columns.clone()];
-            let covered = &covered[v * words..(v + 1) * words];
-            for ((u, out), &grey) in columns.clone().zip(&mut *out).zip(grey) {
-                let texture = background.difference(grey, v * self.width + u) >> TEXTURE_SHIFT;
-                let is_belt = !bits::get(covered, u) && texture.abs() <= TEXTURE_MAX;
-                *out = if is_belt { texture as i8 } else { NO_TEXTURE };
-            }
-            remove_shading(out);
+    fn extract(&mut self, grey: &[u8], background: &Background, covered: &[u64]) {
+        let (words, stride) = (bits::words(self.width), stride(self.width));
+        let (mean, gain) = background.belt();
+        let blocks = Self::blocks(&self.columns);
+        let rows = self.rows.clone().step_by(self.row_step);
+        for (v, out) in rows.zip(self.current.chunks_exact_mut(blocks.len())) {
+            let pixels = v * stride + blocks.start..v * stride + blocks.end;
+            let covered = &covered[v * words..][blocks.start / 64..blocks.end / 64];
+            let belt = (&mean[pixels.clone()], gain);
+            extract(self.level, &grey[pixels], belt, covered, &mut self.sums, out);
+            out[..self.columns.start - blocks.start].fill(NO_TEXTURE);
+            out[self.columns.end - blocks.start..].fill(NO_TEXTURE);
         }
     }
 
@@ -240,9 +253,9 @@ impl Odometry {
     /// Normalised correlation of key and current texture, the belt having moved by `shift`.
     fn correlation(&self, shift: isize) -> (f64, u32) {
         let mut sums = Sums::default();
-        let n = self.columns.len();
+        let n = Self::blocks(&self.columns).len();
         for (key, current) in self.key.chunks_exact(n).zip(self.current.chunks_exact(n)) {
-            correlate(key, current, shift, &mut sums);
+            correlate(self.level, key, current, shift, &mut sums);
         }
         let norm = (sums.aa as f64 * sums.bb as f64).sqrt();
         (if norm > 0.0 { sums.ab as f64 / norm } else { 0.0 }, sums.n)
@@ -276,31 +289,6 @@ fn peak(around: &[f64; PEAK_SHIFTS]) -> Option<f64> {
     is_peak.then(|| best + 0.5 * FINE_PX * (before - after) / curvature)
 }
 
-/// Take the local mean out of a row of texture: shading that a parcel's height makes move faster
-/// than the belt is smooth, the belt's own texture is not.
-fn remove_shading(row: &mut [i8]) {
-    let value = |t: i8| if t == NO_TEXTURE { (0, 0) } else { (i32::from(t), 1) };
-    // The window slides over values that are still untouched: those passed are kept aside.
-    let mut passed = [NO_TEXTURE; SHADING_PX + 1];
-    let (mut sum, mut count) = (0, 0);
-    for &t in row.iter().take(SHADING_PX) {
-        let (t, n) = value(t);
-        (sum, count) = (sum + t, count + n);
-    }
-    for u in 0..row.len() {
-        let (entering, n) = row.get(u + SHADING_PX).map_or((0, 0), |&t| value(t));
-        (sum, count) = (sum + entering, count + n);
-        let slot = u % passed.len();
-        let (leaving, n) = value(passed[slot]);
-        (sum, count) = (sum - leaving, count - n);
-        passed[slot] = row[u];
-        if row[u] != NO_TEXTURE {
-            let high = (i32::from(row[u]) - sum / count).clamp(-TEXTURE_MAX, TEXTURE_MAX);
-            row[u] = high as i8;
-        }
-    }
-}
-
 #[cfg(test)]
 mod tests {
     use super::*;
@@ -323,25 +311,5 @@ mod tests {
     #[test]
     fn a_slope_has_no_peak() {
         assert_eq!(peak(&std::array::from_fn(|k| k as f64)), None);
-    }
-
-    #[test]
-    fn shading_goes_and_texture_stays() {
-        let texture = |u: usize| if u % 4 < 2 { 20 } else { -20 };
-        let hidden = |u: usize| (90..110).contains(&u);
-        let mut row: [i8; 200] = std::array::from_fn(|u| {
-            let shading = (u as i32 - 100) / 2;
-            if hidden(u) { NO_TEXTURE } else { (texture(u) + shading) as i8 }
-        });
-        remove_shading(&mut row);
-        for (u, &value) in row.iter().enumerate() {
-            let error = i32::from(value) - texture(u);
-            // At an end the mean is of one side: half the window's ramp, and the texture's own.
-            let slack = SHADING_PX as i32 / 4 + 4;
-            assert!(
-                if hidden(u) { value == NO_TEXTURE } else { error.abs() <= slack },
-                "{u} {value}"
-            );
-        }
     }
 }

@@ -5,7 +5,7 @@
 
 use crate::config::{Limits, Segment as Settings};
 use crate::error::Result;
-use crate::kernel::scalar::bits::{self, dilate3x3, erode3x3, words};
+use crate::kernel::scalar::bits::{self, dilate, erode, words};
 use crate::kernel::scalar::runs::{Run, collect, resolve};
 use crate::plan::{Block, Memory, Plan};
 
@@ -125,23 +125,16 @@ impl Segment {
     pub fn step(&mut self, foreground: &[u64], strong: &[u64]) {
         self.mask.copy_from_slice(foreground);
         let (open, close) = (self.settings.open_px, self.settings.close_px);
-        self.repeat(erode3x3, open);
-        self.repeat(dilate3x3, open + close);
-        self.repeat(erode3x3, close);
+        let width = self.size_px[0];
+        erode(&mut self.mask, &mut self.scratch, width, open);
+        dilate(&mut self.mask, &mut self.scratch, width, open + close);
+        erode(&mut self.mask, &mut self.scratch, width, close);
         let found = collect(&self.mask, self.size_px[0], &mut self.runs);
         self.run_count = found.min(self.runs.len());
         let labels = resolve(&mut self.runs[..self.run_count]);
         self.gather_blobs(labels, strong);
         if found > self.runs.len() || labels > self.blobs.len() {
             self.overflows += 1;
-        }
-    }
-
-    /// Apply a 3x3 filter `times` times.
-    fn repeat(&mut self, filter: fn(&[u64], &mut [u64], usize), times: usize) {
-        for _ in 0..times {
-            filter(&self.mask, &mut self.scratch, self.size_px[0]);
-            std::mem::swap(&mut self.mask, &mut self.scratch);
         }
     }
 

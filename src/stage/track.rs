@@ -30,6 +30,8 @@ const YOUNG_FRAMES: u32 = 8;
 const FRAGMENT_FRAMES: u32 = 8;
 /// Fewer shared frames than this do not harm a pass.
 const MERGED_FRAMES: u32 = 3;
+/// The end of several pieces follows the belt by at least the rest of this share.
+const LAG_SHARE: f32 = 0.5;
 /// Inside means this share of its box.
 const INSIDE_SHARE: f32 = 0.8;
 
@@ -254,10 +256,14 @@ impl Tracker {
             if track.phase == Phase::Free {
                 continue;
             }
-            let seen = blobs
-                .iter()
-                .filter(|b| self.owners[b.label as usize] == s as u16)
-                .fold(PxBox::default(), |all, b| all.union(&b.bounds));
+            let own = || blobs.iter().filter(|b| self.owners[b.label as usize] == s as u16);
+            let mut seen = own().fold(PxBox::default(), |all, b| all.union(&b.bounds));
+            if own().nth(1).is_some() {
+                // A piece that stays behind, a ghost in the background, is soon out of the box.
+                let largest = own().max_by_key(|b| b.area_px).map_or(seen, |b| b.bounds);
+                let lagging = track.bounds.u0 - LAG_SHARE * step_px.max(0.0) as f32;
+                seen.u0 = seen.u0.max(lagging).min(largest.u0);
+            }
             if track.merged {
                 track.merged_frames += 1;
                 track.unseen_px = 0.0;
@@ -362,6 +368,7 @@ mod tests {
                 .enumerate()
                 .map(|(label, &[u0, u1, v0, v1])| Blob {
                     label: label as u32,
+                    area_px: ((u1 - u0) * (v1 - v0)) as u32,
                     bounds: PxBox { u0, u1, v0, v1 },
                     ..Blob::default()
                 })
@@ -467,6 +474,19 @@ mod tests {
             belt.frame(STEP_MM, &[[u, u + 70.0, 0.0, 40.0]]);
         }
         assert_eq!(belt.phases().iter().filter(|p| **p == Phase::Riding).count(), 1);
+    }
+
+    #[test]
+    fn a_ghost_touched_by_a_parcel_is_left_behind() {
+        let mut belt = Belt::new();
+        let ghost = [10.0, 18.0, 10.0, 20.0];
+        for i in 0..30u8 {
+            belt.frame(STEP_MM, &[at(f32::from(i) * 10.0, 0.0), ghost]);
+        }
+        let riding: Vec<&Track> =
+            belt.tracker.tracks().iter().filter(|t| t.phase == Phase::Riding).collect();
+        assert_eq!(riding.len(), 1);
+        assert!(riding[0].bounds.u0 > 280.0, "{:?}", riding[0].bounds);
     }
 
     #[test]

@@ -8,6 +8,11 @@ pub const fn words(width: usize) -> usize {
     width.div_ceil(64)
 }
 
+/// Pixels from one row to the next in a plane beside such a mask: rows are whole words.
+pub const fn stride(width: usize) -> usize {
+    words(width) * 64
+}
+
 /// The valid bits of a row's last word.
 pub const fn last_word_mask(width: usize) -> u64 {
     match width % 64 {
@@ -46,46 +51,74 @@ fn for_words(start: u16, end: u16, mut visit: impl FnMut(usize, u64)) {
     }
 }
 
-/// 3x3 dilation of `src` into `dst`, rows of `width` pixels.
-pub fn dilate3x3(src: &[u64], dst: &mut [u64], width: usize) {
-    filter3x3(src, dst, width, false);
+/// Widen every shape of a mask, rows of `width` pixels, by a square of `radius` to all sides.
+/// `scratch` has the mask's size. `radius` is at most 63.
+pub fn dilate(mask: &mut [u64], scratch: &mut [u64], width: usize, radius: usize) {
+    filter(mask, scratch, width, radius, 0);
 }
 
-/// 3x3 erosion of `src` into `dst`: the dilation of the complement, complemented.
-pub fn erode3x3(src: &[u64], dst: &mut [u64], width: usize) {
-    filter3x3(src, dst, width, true);
+/// Narrow every shape: the dilation of the complement, complemented.
+pub fn erode(mask: &mut [u64], scratch: &mut [u64], width: usize, radius: usize) {
+    filter(mask, scratch, width, radius, u64::MAX);
 }
 
-/// Dilation of `src ^ invert`, written `^ invert`.
-fn filter3x3(src: &[u64], dst: &mut [u64], width: usize, invert: bool) {
+/// Dilation of `mask ^ flip`, written `^ flip`: along the rows, then across them.
+fn filter(mask: &mut [u64], scratch: &mut [u64], width: usize, radius: usize, flip: u64) {
     let n = words(width);
-    let rows = src.len() / n;
-    let flip = if invert { u64::MAX } else { 0 };
-    let mask = |w: usize| if w + 1 == n { last_word_mask(width) } else { u64::MAX };
-    for y in 0..rows {
-        let above = y.saturating_sub(1);
-        let below = (y + 1).min(rows - 1);
-        // A row outside repeats the centre row, which changes no maximum.
-        let column = |w: usize| {
-            let any = [above, y, below].iter().fold(0, |acc, r| acc | (src[r * n + w] ^ flip));
-            any & mask(w)
+    if n == 0 || radius == 0 {
+        return;
+    }
+    let last = last_word_mask(width);
+    for (row, out) in mask.chunks_exact(n).zip(scratch.chunks_exact_mut(n)) {
+        let word = |w: usize| {
+            let valid = if w + 1 == n { last } else { u64::MAX };
+            row.get(w).map_or(0, |bits| (bits ^ flip) & valid)
         };
-        let mut left = 0;
-        let mut centre = column(0);
-        for w in 0..n {
-            let right = if w + 1 < n { column(w + 1) } else { 0 };
-            let spread = centre | centre << 1 | left >> 63 | centre >> 1 | right << 63;
-            dst[y * n + w] = (spread ^ flip) & mask(w);
-            (left, centre) = (centre, right);
+        let (mut before, mut here) = (0, word(0));
+        for (w, out) in out.iter_mut().enumerate() {
+            let after = word(w + 1);
+            *out = spread([before, here, after], radius);
+            (before, here) = (here, after);
         }
     }
+    let rows = mask.len() / n;
+    for (y, out) in mask.chunks_exact_mut(n).enumerate() {
+        let near = y.saturating_sub(radius)..(y + radius + 1).min(rows);
+        out.fill(0);
+        for row in scratch[near.start * n..near.end * n].chunks_exact(n) {
+            for (out, bits) in out.iter_mut().zip(row) {
+                *out |= bits;
+            }
+        }
+        for out in &mut *out {
+            *out ^= flip;
+        }
+        out[n - 1] &= last;
+    }
+}
+
+/// The middle one of three words, its bits spread by `radius` places to both sides.
+fn spread([before, here, after]: [u64; 3], radius: usize) -> u64 {
+    if before | here | after == 0 {
+        return 0;
+    }
+    let mut up = u128::from(here) << 64 | u128::from(before);
+    let mut down = u128::from(after) << 64 | u128::from(here);
+    let mut reached = 0;
+    while reached < radius {
+        let step = (reached + 1).min(radius - reached);
+        up |= up << step;
+        down |= down >> step;
+        reached += step;
+    }
+    (up >> 64) as u64 | down as u64
 }
 
 #[cfg(test)]
 mod tests {
     use super::*;
 
-    fn naive(src: &[u64], width: usize, rows: usize, erode: bool) -> Vec<u64> {
+    fn naive(src: &[u64], width: usize, rows: usize, radius: i64, erode: bool) -> Vec<u64> {
         let n = words(width);
         let get = |x: i64, y: i64| {
             let inside = x >= 0 && y >= 0 && x < width as i64 && y < rows as i64;
@@ -94,7 +127,8 @@ mod tests {
         let mut out = vec![0; src.len()];
         for y in 0..rows as i64 {
             for x in 0..width as i64 {
-                let mut near = (-1..=1).flat_map(|dy| (-1..=1).map(move |dx| (dx, dy)));
+                let mut near =
+                    (-radius..=radius).flat_map(|dy| (-radius..=radius).map(move |dx| (dx, dy)));
                 let set = if erode {
                     near.all(|(dx, dy)| get(x + dx, y + dy))
                 } else {
@@ -137,11 +171,18 @@ mod tests {
                     for row in src.chunks_mut(n) {
                         row[n - 1] &= last_word_mask(width);
                     }
-                    let mut out = vec![0xa5a5; n * rows];
-                    dilate3x3(&src, &mut out, width);
-                    assert_eq!(out, naive(&src, width, rows, false), "dilate {width}x{rows}");
-                    erode3x3(&src, &mut out, width);
-                    assert_eq!(out, naive(&src, width, rows, true), "erode {width}x{rows}");
+                    for radius in [0, 1, 2, 3, 8, 63] {
+                        let mut scratch = vec![0xa5a5; n * rows];
+                        let mut out = src.clone();
+                        dilate(&mut out, &mut scratch, width, radius);
+                        let side = radius as i64;
+                        let expected = naive(&src, width, rows, side, false);
+                        assert_eq!(out, expected, "dilate {width}x{rows} by {radius}");
+                        out.copy_from_slice(&src);
+                        erode(&mut out, &mut scratch, width, radius);
+                        let expected = naive(&src, width, rows, side, true);
+                        assert_eq!(out, expected, "erode {width}x{rows} by {radius}");
+                    }
                 }
             }
         }

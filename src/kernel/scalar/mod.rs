@@ -1,9 +1,9 @@
 //! Plain Rust, written to be read: what every faster kernel is compared with.
 
 pub mod bits;
-pub mod correlate;
 pub mod flow;
 pub mod mixture;
 pub mod profile;
 pub mod remap;
 pub mod runs;
+pub mod texture;

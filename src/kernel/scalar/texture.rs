@@ -1,0 +1,154 @@
+//! Belt texture: taking it out of a row of the view, and matching two rows: the specification.
+//!
+//! Texture is in 1/16 grey level.
+
+use super::mixture::{Gain, observation};
+
+/// Value of a pixel that shows no belt texture (foreground, not seen).
+pub const NO_TEXTURE: i8 = i8::MIN;
+/// Differences beyond 7 grey levels are shadows, dirt or parcels, not texture.
+pub const TEXTURE_MAX: u16 = 112;
+/// A difference of Q7 is shifted by this.
+pub const TEXTURE_SHIFT: u32 = 3;
+/// Half width of the window whose mean is taken out of the texture.
+pub const SHADING_PX: usize = 16;
+/// Elements of the running sums of a row besides one a pixel.
+pub const SUMS_BORDER: usize = 2 * SHADING_PX + 1;
+/// Running sums hold the sum of the values above this bit, their number below it. Rows are
+/// shorter than `2^COUNT_BITS`.
+pub const COUNT_BITS: u32 = 13;
+
+/// Texture of a row: grey levels less the belt's mean. `covered`: bit mask of what is not belt.
+pub fn extract(grey: &[u8], mean: &[u16], gain: Gain, covered: &[u64], out: &mut [i8]) {
+    for (u, ((out, &grey), &mean)) in out.iter_mut().zip(grey).zip(mean).enumerate() {
+        let x = observation(grey, gain);
+        let size = x.abs_diff(mean) >> TEXTURE_SHIFT;
+        let is_belt = size <= TEXTURE_MAX && covered[u / 64] >> (u % 64) & 1 == 0;
+        let signed = if x > mean { size as i16 } else { -(size as i16) };
+        *out = if is_belt { signed as i8 } else { NO_TEXTURE };
+    }
+}
+
+/// Running sums of a row for [`remove_shading`], beginning [`SHADING_PX`] pixels before it;
+/// `sums` has [`SUMS_BORDER`] elements more than the row. They wrap; their differences do not.
+pub fn running_sums(row: &[i8], sums: &mut [i32]) {
+    let (before, rest) = sums.split_at_mut(SHADING_PX + 1);
+    before.fill(0);
+    let (inside, after) = rest.split_at_mut(row.len());
+    let mut sum = 0i32;
+    for (out, &value) in inside.iter_mut().zip(row) {
+        let is_texture = i32::from(value != NO_TEXTURE);
+        sum = sum.wrapping_add(is_texture * ((i32::from(value) << COUNT_BITS) + 1));
+        *out = sum;
+    }
+    after.fill(sum);
+}
+
+/// Take the local mean out of a row: shading that a parcel's height makes move faster than the belt
+/// is smooth, the belt's own texture is not. `sums`: its [`running_sums`].
+pub fn remove_shading(row: &mut [i8], sums: &[i32]) {
+    let limit = i32::from(TEXTURE_MAX);
+    for (u, value) in row.iter_mut().enumerate().filter(|(_, value)| **value != NO_TEXTURE) {
+        let window = sums[u + SUMS_BORDER].wrapping_sub(sums[u]);
+        let (sum, count) = (window >> COUNT_BITS, window & ((1 << COUNT_BITS) - 1));
+        *value = (i32::from(*value) - sum / count).clamp(-limit, limit) as i8;
+    }
+}
+
+/// Sums over the overlap of a key row and a current row.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub struct Sums {
+    /// Sum of products.
+    pub ab: i64,
+    /// Sum of squares of the key row.
+    pub aa: i64,
+    /// Sum of squares of the current row.
+    pub bb: i64,
+    /// Pixel pairs with texture on both sides.
+    pub n: u32,
+}
+
+/// The pixels of `key` and `current` that lie on each other when `current` has moved by `shift`.
+pub fn overlap<'a>(key: &'a [i8], current: &'a [i8], shift: isize) -> (&'a [i8], &'a [i8]) {
+    let key = key.get((-shift).max(0) as usize..).unwrap_or_default();
+    let current = current.get(shift.max(0) as usize..).unwrap_or_default();
+    let n = key.len().min(current.len());
+    (&key[..n], &current[..n])
+}
+
+/// Add the products of `key[i]` and `current[i + shift]` over their overlap.
+pub fn correlate(key: &[i8], current: &[i8], shift: isize, sums: &mut Sums) {
+    let (key, current) = overlap(key, current, shift);
+    for (&a, &b) in key.iter().zip(current) {
+        if a != NO_TEXTURE && b != NO_TEXTURE {
+            let (a, b) = (i64::from(a), i64::from(b));
+            sums.ab += a * b;
+            sums.aa += a * a;
+            sums.bb += b * b;
+            sums.n += 1;
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn the_true_shift_correlates_fully_both_ways() {
+        let texture: Vec<i8> = (0..200).map(|i: i32| (i * i % 17 - 8) as i8).collect();
+        for (key, current, shift) in
+            [(&texture[..150], &texture[20..170], -20), (&texture[20..170], &texture[..150], 20)]
+        {
+            let mut sums = Sums::default();
+            correlate(key, current, shift, &mut sums);
+            assert_eq!((sums.n, sums.ab), (130, sums.aa));
+            assert_eq!(sums.aa, sums.bb);
+        }
+    }
+
+    #[test]
+    fn pixels_without_texture_do_not_count() {
+        let mut sums = Sums::default();
+        correlate(&[3, NO_TEXTURE, 5], &[3, 4, NO_TEXTURE], 0, &mut sums);
+        assert_eq!(sums, Sums { ab: 9, aa: 9, bb: 9, n: 1 });
+    }
+
+    #[test]
+    fn a_shift_beyond_the_row_adds_nothing() {
+        let mut sums = Sums::default();
+        correlate(&[1; 4], &[1; 4], 9, &mut sums);
+        correlate(&[1; 4], &[1; 4], -9, &mut sums);
+        assert_eq!(sums, Sums::default());
+    }
+
+    #[test]
+    fn texture_is_the_difference_from_the_belt_where_it_is_small_and_free() {
+        let mut out = [0; 4];
+        let mean = [100 << 7; 4];
+        extract(&[101, 98, 110, 101], &mean, Gain::ONE, &[0b1000], &mut out);
+        assert_eq!(out, [16, -32, NO_TEXTURE, NO_TEXTURE]);
+    }
+
+    #[test]
+    fn shading_goes_and_texture_stays() {
+        let texture = |u: usize| if u % 4 < 2 { 20 } else { -20 };
+        let hidden = |u: usize| (90..110).contains(&u);
+        let mut row: [i8; 200] = std::array::from_fn(|u| {
+            let shading = (u as i32 - 100) / 2;
+            if hidden(u) { NO_TEXTURE } else { (texture(u) + shading) as i8 }
+        });
+        let mut sums = [0; 200 + SUMS_BORDER];
+        running_sums(&row, &mut sums);
+        remove_shading(&mut row, &sums);
+        for (u, &value) in row.iter().enumerate() {
+            let error = i32::from(value) - texture(u);
+            // At an end the mean is of one side: half the window's ramp, and the texture's own.
+            let slack = SHADING_PX as i32 / 4 + 4;
+            assert!(
+                if hidden(u) { value == NO_TEXTURE } else { error.abs() <= slack },
+                "{u} {value}"
+            );
+        }
+    }
+}

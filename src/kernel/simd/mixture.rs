@@ -1,0 +1,413 @@
+//! [`crate::kernel::scalar::mixture`] for 64 pixels at once: what belongs to the main mode is
+//! learned in vectors, what does not is classified in vectors, and the few pixels that have or
+//! need a second mode are left to the specification.
+//!
+//! Cost: 1 byte of image, 4 of model read and 4 written a pixel of the common kind; 2 more of
+//! each in a block that has a pixel with a second mode.
+
+use crate::kernel::scalar::mixture::{
+    Class, Gain, MATCH_Q8, MEAN_GAINED, MINORS, Minor, PRIOR, Params, Pixel, SHADOW_MEAN_MIN,
+    VARIANCE_GAINED, VARIANCE_MIN, is_strong, observation, update as update_pixel,
+};
+use fearless_simd::{Level, dispatch, prelude::*};
+
+/// Pixels of a block: the bits of a mask's word.
+pub const BLOCK: usize = 64;
+
+/// The model of a stretch of pixels, a whole number of blocks.
+#[derive(Debug)]
+pub struct Model<'a> {
+    /// Means of the main mode, Q7.
+    pub mean: &'a mut [u16],
+    /// Variances of the main mode, Q10.
+    pub variance: &'a mut [u16],
+    /// Weaker modes, the heavier first.
+    pub minors: [Minors<'a>; MINORS],
+    /// Bit: the pixel has a second mode.
+    pub multiple: &'a mut [u64],
+}
+
+/// One weaker mode of a stretch of pixels: see [`Minor`].
+#[derive(Debug)]
+pub struct Minors<'a> {
+    /// Means, Q7.
+    pub mean: &'a mut [u16],
+    /// Variances, Q2.
+    pub variance: &'a mut [u8],
+    /// Weights, 1/255; 0: no mode.
+    pub weight: &'a mut [u8],
+}
+
+impl Minors<'_> {
+    fn get(&self, i: usize) -> Minor {
+        Minor { mean: self.mean[i], variance: self.variance[i], weight: self.weight[i] }
+    }
+
+    fn set(&mut self, i: usize, minor: Minor) {
+        self.mean[i] = minor.mean;
+        self.variance[i] = minor.variance;
+        self.weight[i] = minor.weight;
+    }
+}
+
+/// Bits of a stretch of pixels, a word for each block.
+#[derive(Debug)]
+pub struct Masks<'a> {
+    /// Foreground, dark pixels included; shadows are none.
+    pub foreground: &'a mut [u64],
+    /// Dark pixels.
+    pub dark: &'a mut [u64],
+    /// Foreground at twice the distance that makes a pixel foreground.
+    pub strong: &'a mut [u64],
+}
+
+/// Classify `grey`, a whole number of blocks, and learn it where the bits of `hold` are not set.
+pub fn update(
+    level: Level,
+    grey: &[u8],
+    model: &mut Model<'_>,
+    hold: &[u64],
+    masks: &mut Masks<'_>,
+    params: &Params,
+) {
+    dispatch!(level, simd => update_blocks(simd, grey, model, hold, masks, params));
+}
+
+#[inline(always)]
+fn update_blocks<S: Simd>(
+    simd: S,
+    grey: &[u8],
+    model: &mut Model<'_>,
+    hold: &[u64],
+    masks: &mut Masks<'_>,
+    params: &Params,
+) {
+    let (greys, _) = grey.as_chunks::<BLOCK>();
+    let (means, _) = model.mean.as_chunks_mut::<BLOCK>();
+    let (variances, _) = model.variance.as_chunks_mut::<BLOCK>();
+    let main = greys.iter().zip(means).zip(variances);
+    let bits = hold.iter().zip(&mut *model.multiple);
+    for (w, (((grey, mean), variance), (&hold, multiple))) in main.zip(bits).enumerate() {
+        let (within, near) = if hold == 0 {
+            follow::<S, true>(simd, grey, mean, variance, u64::MAX, params)
+        } else {
+            follow::<S, false>(simd, grey, mean, variance, !hold, params)
+        };
+        let mut found = Found::default();
+        if within != u64::MAX {
+            found = shade(simd, grey, mean, variance, !within, params);
+        }
+        // Where the main mode learns, the weaker ones fade.
+        let fading = near & *multiple & !hold;
+        if fading != 0 {
+            let [first, second] = &mut model.minors;
+            let lasting = fade(simd, &mut first.weight[w * BLOCK..][..BLOCK], fading, params)
+                | fade(simd, &mut second.weight[w * BLOCK..][..BLOCK], fading, params);
+            *multiple = (*multiple & !fading) | (lasting & fading);
+        }
+        // A pixel of its own: it may belong to a second mode, or needs one.
+        let alone = !near & (*multiple | (!hold & !found.shadow));
+        if alone != 0 {
+            let (main, minors) = ([mean, variance], &mut model.minors);
+            let more = one_by_one(&mut found, alone, hold, grey, main, minors, w * BLOCK, params);
+            *multiple = (*multiple & !alone) | more;
+        }
+        masks.foreground[w] = found.foreground;
+        masks.dark[w] = found.dark;
+        masks.strong[w] = found.strong;
+    }
+}
+
+/// Bits of a block.
+#[derive(Clone, Copy, Default)]
+struct Found {
+    foreground: u64,
+    shadow: u64,
+    dark: u64,
+    strong: u64,
+}
+
+/// Let the weights of the pixels of `fading` fade; returns which are not zero.
+#[inline(always)]
+fn fade<S: Simd>(simd: S, weights: &mut [u8], fading: u64, params: &Params) -> u64 {
+    let n = S::u8s::LEN;
+    let (mantissa, shift, dither) = params.rate.for_weight();
+    let mut lasting = 0;
+    for (k, weights) in weights.chunks_exact_mut(n).enumerate() {
+        let weight = S::u8s::from_slice(simd, weights);
+        let (low, high) = weight.widen();
+        let low = ((low + PRIOR) * mantissa + dither) >> shift;
+        let high = ((high + PRIOR) * mantissa + dither) >> shift;
+        let faded = weight.saturating_sub(low.narrow(high));
+        let fades = S::mask8s::from_bitmask(simd, fading >> (k * n));
+        let weight = fades.select(faded, weight);
+        weight.store_slice(weights);
+        lasting |= weight.simd_gt(0).to_bitmask() << (k * n);
+    }
+    lasting
+}
+
+/// The specification for the pixels of `alone`, a block that begins at pixel `from`; returns which
+/// of them have a second mode.
+#[expect(clippy::too_many_arguments, reason = "a block's parts, as they are borrowed")]
+fn one_by_one(
+    found: &mut Found,
+    alone: u64,
+    hold: u64,
+    grey: &[u8; BLOCK],
+    [mean, variance]: [&mut [u16; BLOCK]; 2],
+    [first, second]: &mut [Minors<'_>; MINORS],
+    from: usize,
+    params: &Params,
+) -> u64 {
+    let mut multiple = 0;
+    let mut left = alone;
+    while left != 0 {
+        let i = left.trailing_zeros() as usize;
+        let bit = 1 << i;
+        left &= left - 1;
+        let minors = [first.get(from + i), second.get(from + i)];
+        let mut pixel = Pixel { mean: mean[i], variance: variance[i], minors };
+        let x = observation(grey[i], params.gain);
+        let strong = is_strong(x, &pixel, params);
+        let class = update_pixel(x, &mut pixel, hold & bit == 0, params);
+        (mean[i], variance[i]) = (pixel.mean, pixel.variance);
+        first.set(from + i, pixel.minors[0]);
+        second.set(from + i, pixel.minors[1]);
+        let is_foreground = matches!(class, Class::Foreground | Class::Dark);
+        for (mask, on) in [
+            (&mut found.foreground, is_foreground),
+            (&mut found.dark, class == Class::Dark),
+            (&mut found.strong, is_foreground && strong),
+            (&mut multiple, pixel.is_multiple()),
+        ] {
+            *mask = (*mask & !bit) | if on { bit } else { 0 };
+        }
+    }
+    multiple
+}
+
+/// Observations, Q7, of one vector of grey levels: its lower and upper half.
+#[inline(always)]
+fn observe<S: Simd>(grey: S::u8s, params: &Params) -> [S::u16s; 2] {
+    let (low, high) = grey.widen();
+    [brighten::<S>(low, params.gain), brighten::<S>(high, params.gain)]
+}
+
+/// [`observation`] of grey levels.
+#[inline(always)]
+pub(super) fn brighten<S: Simd>(grey: S::u16s, gain: Gain) -> S::u16s {
+    grey * gain.whole + ((grey * gain.part) >> 8)
+}
+
+#[inline(always)]
+fn part_of<S: Simd>(mean: S::u16s, ratio_q8: u16) -> S::u16s {
+    (mean >> 8) * ratio_q8 + (((mean & 255) * ratio_q8) >> 8)
+}
+
+#[inline(always)]
+fn abs_diff<S: Simd>(a: S::u16s, b: S::u16s) -> S::u16s {
+    a.max(b) - a.min(b)
+}
+
+/// Let the main modes follow the pixels of `learn` (all: `ALL`) that are near to them; returns the
+/// bits of those within reach, and of those near.
+#[inline(always)]
+fn follow<S: Simd, const ALL: bool>(
+    simd: S,
+    grey: &[u8; BLOCK],
+    mean: &mut [u16; BLOCK],
+    variance: &mut [u16; BLOCK],
+    learn: u64,
+    params: &Params,
+) -> (u64, u64) {
+    let n = S::u16s::LEN;
+    let (mean_shift, mean_dither) = params.rate.shift(MEAN_GAINED);
+    let (variance_shift, variance_dither) = params.rate.shift(VARIANCE_GAINED);
+    let mantissa = params.rate.mantissa;
+    let (mut all_within, mut all_near) = (0, 0);
+    for at in (0..BLOCK).step_by(2 * n) {
+        let grey = S::u8s::from_slice(simd, &grey[at..at + 2 * n]);
+        let [low, high] = observe::<S>(grey, params);
+        for (at, x) in [(at, low), (at + n, high)] {
+            let m = S::u16s::from_slice(simd, &mean[at..at + n]);
+            let v = S::u16s::from_slice(simd, &variance[at..at + n]);
+            let difference = abs_diff::<S>(x, m);
+            let distance = (difference >> 4).min(255);
+            let reach = ((distance * params.reach_q8) >> 6).min(255);
+            all_within |= (reach * reach).simd_lt(v).to_bitmask() << at;
+            let reach = ((distance * MATCH_Q8) >> 6).min(255);
+            let near = (reach * reach).simd_lt(v);
+            all_near |= near.to_bitmask() << at;
+            let moves = if ALL { near } else { near & S::mask16s::from_bitmask(simd, learn >> at) };
+            let step = (distance * mantissa + mean_dither) >> mean_shift;
+            let moved = x.simd_gt(m).select(m + step, m - step);
+            moves.select(moved, m).store_slice(&mut mean[at..at + n]);
+            let root = (difference >> 2).min(255);
+            let square = root * root;
+            let step = (abs_diff::<S>(square, v) >> VARIANCE_GAINED) * mantissa + variance_dither;
+            let step = step >> variance_shift;
+            let shrunk = v.saturating_sub(step).max(VARIANCE_MIN);
+            let moved = square.simd_gt(v).select(v.saturating_add(step), shrunk);
+            moves.select(moved, v).store_slice(&mut variance[at..at + n]);
+        }
+    }
+    (all_within, all_near)
+}
+
+/// Classes of the pixels of `outside`, which do not belong to their main mode.
+#[inline(always)]
+fn shade<S: Simd>(
+    simd: S,
+    grey: &[u8; BLOCK],
+    mean: &[u16; BLOCK],
+    variance: &[u16; BLOCK],
+    outside: u64,
+    params: &Params,
+) -> Found {
+    let n = S::u16s::LEN;
+    let mut found = Found::default();
+    for at in (0..BLOCK).step_by(2 * n) {
+        let grey = S::u8s::from_slice(simd, &grey[at..at + 2 * n]);
+        let [low, high] = observe::<S>(grey, params);
+        for (at, x) in [(at, low), (at + n, high)] {
+            let m = S::u16s::from_slice(simd, &mean[at..at + n]);
+            let v = S::u16s::from_slice(simd, &variance[at..at + n]);
+            let darker = x.simd_lt(m) & m.simd_ge(SHADOW_MEAN_MIN);
+            let shadow = darker & x.simd_ge(part_of::<S>(m, params.shadow_ratio_q8));
+            let dark = darker & x.simd_ge(part_of::<S>(m, params.dark_ratio_q8)) & !shadow;
+            let distance = (abs_diff::<S>(x, m) >> 4).min(255);
+            let half_reach = ((distance * params.reach_q8) >> 6).min(255) >> 1;
+            let strong = (half_reach * half_reach).simd_ge(v);
+            found.shadow |= shadow.to_bitmask() << at;
+            found.dark |= dark.to_bitmask() << at;
+            found.strong |= strong.to_bitmask() << at;
+        }
+    }
+    found.shadow &= outside;
+    found.foreground = outside & !found.shadow;
+    found.dark &= found.foreground;
+    found.strong &= found.foreground;
+    found
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::kernel::scalar::mixture::{Rate, VARIANCE_NEW};
+    use crate::kernel::simd::each_level;
+
+    const BLOCKS: usize = 3;
+    const N: usize = BLOCKS * BLOCK;
+
+    struct Random(u64);
+
+    impl Random {
+        fn next(&mut self) -> u64 {
+            self.0 = self.0.wrapping_mul(6_364_136_223_846_793_005).wrapping_add(1);
+            self.0 >> 24
+        }
+    }
+
+    fn params(frame: u32, gain: u32, reach_q8: u16) -> Params {
+        Params {
+            rate: Rate::new((frame + 2).min(40), frame),
+            gain: Gain::from_q15(gain),
+            reach_q8,
+            background_share: 229,
+            shadow_ratio_q8: 184,
+            dark_ratio_q8: 77,
+        }
+    }
+
+    /// Runs frames through both and compares every byte of model and masks after each.
+    fn compare(
+        level: Level,
+        greys: &mut dyn FnMut(u32) -> [u8; N],
+        holds: &mut dyn FnMut() -> u64,
+    ) {
+        let first = greys(0).map(|g| observation(g, Gain::ONE));
+        let mut pixels = first.map(Pixel::new);
+        let (mut mean, mut variance) = (first, [VARIANCE_NEW; N]);
+        let mut minors = [([0u16; N], [0u8; N], [0u8; N]); MINORS];
+        let mut multiple = [0u64; BLOCKS];
+        for frame in 0..80 {
+            let params = params(frame, 32768 + 300 * (frame % 7), 40 + 24 * (frame as u16 % 2));
+            let grey = greys(frame + 1);
+            let hold: [u64; BLOCKS] = std::array::from_fn(|_| holds());
+            let mut model = Model {
+                mean: &mut mean,
+                variance: &mut variance,
+                minors: minors.each_mut().map(|(mean, variance, weight)| Minors {
+                    mean,
+                    variance,
+                    weight,
+                }),
+                multiple: &mut multiple,
+            };
+            let mut masks = [[0xa5a5; BLOCKS]; 3];
+            let [foreground, dark, strong] = &mut masks;
+            let mut out = Masks { foreground, dark, strong };
+            update(level, &grey, &mut model, &hold, &mut out, &params);
+            for (i, pixel) in pixels.iter_mut().enumerate() {
+                let (w, bit) = (i / BLOCK, i % BLOCK);
+                let x = observation(grey[i], params.gain);
+                let far = is_strong(x, pixel, &params);
+                let class = update_pixel(x, pixel, hold[w] >> bit & 1 == 0, &params);
+                let expected = [
+                    matches!(class, Class::Foreground | Class::Dark),
+                    class == Class::Dark,
+                    far && matches!(class, Class::Foreground | Class::Dark),
+                ];
+                let got = masks.map(|mask| mask[w] >> bit & 1 == 1);
+                assert_eq!(got, expected, "{level:?} frame {frame} pixel {i} {pixel:?}");
+                let got = Pixel {
+                    mean: mean[i],
+                    variance: variance[i],
+                    minors: minors.map(|m| Minor {
+                        mean: m.0[i],
+                        variance: m.1[i],
+                        weight: m.2[i],
+                    }),
+                };
+                assert_eq!(got, *pixel, "{level:?} frame {frame} pixel {i}");
+                assert_eq!(multiple[w] >> bit & 1 == 1, pixel.is_multiple());
+            }
+        }
+    }
+
+    #[test]
+    fn every_level_gives_the_bits_of_the_specification() {
+        each_level(|level| {
+            for fill in [0, 255] {
+                compare(level, &mut |_| [fill; N], &mut || 0);
+                compare(level, &mut |_| [fill; N], &mut || u64::MAX);
+                compare(
+                    level,
+                    &mut |frame| [if frame % 9 == 0 { 255 - fill } else { fill }; N],
+                    &mut || 0,
+                );
+            }
+            let mut random = Random(5);
+            compare(level, &mut |_| std::array::from_fn(|_| random.next() as u8), &mut || 0);
+            // A belt with noise, shadows, parcels and held stretches.
+            let (mut random, mut other) = (Random(6), Random(7));
+            let mut scene = |frame: u32| {
+                std::array::from_fn(|i| {
+                    let noise = random.next() % 7 + random.next() % 7;
+                    let place = (i as u32 + 3 * frame) % 190;
+                    let base = match place {
+                        0..20 => 160,
+                        20..30 => 75,
+                        30..40 => 40,
+                        _ => 100,
+                    };
+                    (base + noise) as u8
+                })
+            };
+            compare(level, &mut scene, &mut || {
+                if other.next() % 3 == 0 { other.next() } else { 0 }
+            });
+        });
+    }
+}
