@@ -31,6 +31,11 @@ impl Pair {
     fn new(name: &'static str) -> Self {
         Self { name, ..Self::default() }
     }
+
+    fn clear(&mut self) {
+        self.ours.clear();
+        self.theirs.clear();
+    }
 }
 
 fn timed<T>(times: &mut Vec<Duration>, work: impl FnOnce() -> T) -> T {
@@ -57,7 +62,7 @@ fn main() {
     chain(&scene);
 }
 
-/// The stages one by one, each on what OpenCV or we made of the frame before it.
+/// The stages one by one, each on what `OpenCV` or we made of the frame before it.
 fn stages(scene: &Scene) -> Vec<Pair> {
     let site = &scene.site;
     let (size, level) = (site.view.size_px, Level::new());
@@ -92,7 +97,9 @@ fn stages(scene: &Scene) -> Vec<Pair> {
         timed(&mut floor.ours, || copy.copy_from_slice(&model));
         floor.theirs.push(*learn.ours.last().expect("timed"));
         if n < 40 {
-            pairs.iter_mut().for_each(|p| (p.ours.clear(), p.theirs.clear()).0);
+            for pair in &mut pairs {
+                pair.clear();
+            }
         }
     }
     pairs.into()
@@ -112,7 +119,7 @@ fn chain(scene: &Scene) {
         });
         timed(&mut pair.theirs, || theirs.step(frame));
         if n < 40 {
-            (pair.ours.clear(), pair.theirs.clear()).0
+            pair.clear();
         }
     }
     let (ours, other) = (median_ms(&pair.ours), median_ms(&pair.theirs));

@@ -35,7 +35,7 @@ impl Chain {
     /// The same geometry and settings as a site's pipeline.
     ///
     /// # Panics
-    /// When OpenCV refuses: then nothing can be compared.
+    /// When `OpenCV` refuses: then nothing can be compared.
     pub fn new(site: &Site) -> Self {
         let [width, height] = site.view.size_px.map(|n| n as i32);
         let mut xy = [(); 2].map(|()| {
@@ -78,7 +78,7 @@ impl Chain {
     /// Raw frame to belt view.
     ///
     /// # Panics
-    /// When OpenCV refuses; so do the other steps.
+    /// When `OpenCV` refuses.
     pub fn rectify(&mut self, frame: &[u8]) {
         let width = frame.len() as i32 / self.height;
         let raw = Mat::new_rows_cols_with_data(self.height, width, frame).expect("a frame");
@@ -95,6 +95,9 @@ impl Chain {
     }
 
     /// Belt view to foreground.
+    ///
+    /// # Panics
+    /// When `OpenCV` refuses.
     pub fn subtract(&mut self) {
         BackgroundSubtractorMOG2Trait::apply(
             &mut self.subtractor,
@@ -106,12 +109,18 @@ impl Chain {
     }
 
     /// Foreground to blobs.
+    ///
+    /// # Panics
+    /// When `OpenCV` refuses.
     pub fn label(&mut self) {
         self.open_and_close();
         self.connect();
     }
 
     /// Morphology alone.
+    ///
+    /// # Panics
+    /// When `OpenCV` refuses.
     pub fn open_and_close(&mut self) {
         let square = imgproc::get_structuring_element(
             imgproc::MORPH_RECT,
@@ -132,6 +141,9 @@ impl Chain {
     }
 
     /// Labels alone.
+    ///
+    /// # Panics
+    /// When `OpenCV` refuses.
     pub fn connect(&mut self) {
         imgproc::connected_components_with_stats(
             &self.mask,
@@ -146,6 +158,9 @@ impl Chain {
 
     /// Corners in the blobs followed from the last frame, new ones found, and each blob's smallest
     /// rectangle: what a tracker and a measurement need at least.
+    ///
+    /// # Panics
+    /// When `OpenCV` refuses.
     pub fn measure(&mut self) {
         if !self.corners.is_empty() {
             let (mut next, mut status, mut error) =
@@ -202,6 +217,9 @@ impl Chain {
     }
 
     /// One frame.
+    ///
+    /// # Panics
+    /// When `OpenCV` refuses.
     pub fn step(&mut self, frame: &[u8]) {
         self.rectify(frame);
         self.subtract();
