@@ -149,7 +149,8 @@ impl Pipeline {
         if !self.background.learned() {
             return Ok(());
         }
-        self.segment.step(self.background.foreground(), self.background.strong());
+        let background = &self.background;
+        self.segment.step(background.foreground(), background.strong(), background.dark());
         self.cover();
         let motion =
             self.odometry.step(self.rectify.pixels(), &self.background, &self.covered, dt_s);

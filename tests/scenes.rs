@@ -30,8 +30,12 @@ translation_mm = [0.0, -78.5039, 1497.9443]
 
 /// A scenario at 30 fps: `frames` long, with `tables` besides camera and belt.
 fn scenario(frames: u64, speed_mm_per_s: f64, tables: &str) -> Scenario {
+    scenario_seen_by(CAMERA, frames, speed_mm_per_s, tables)
+}
+
+fn scenario_seen_by(camera: &str, frames: u64, speed_mm_per_s: f64, tables: &str) -> Scenario {
     let text = format!(
-        "seed = 11\nfps = 30\nframes = {frames}\nexposure_ms = 1.5\n{CAMERA}\
+        "seed = 11\nfps = 30\nframes = {frames}\nexposure_ms = 1.5\n{camera}\
          [belt]\nspeed_mm_per_s = {speed_mm_per_s}\nwidth_mm = 800\ngrey = 45\ntexture_grey = 1.3\n{tables}"
     );
     Scenario::parse(&text).expect("a valid scenario")
@@ -172,6 +176,50 @@ fn a_parcel_longer_than_the_zone_is_measured_by_its_motion() {
     assert_sizes(&pairs, 10.0, HEIGHT_MM);
     assert!((pairs[0].1.width_mm - 200.0).abs() < FOOTPRINT_MM);
     assert!(pairs[0].1.flags.has(Flags::FOOTPRINT_UNCERTAIN), "{:?}", pairs[0].1);
+}
+
+/// Free belt between neighbours.
+const GAP_MM: f64 = 10.0;
+
+/// Two parcels one behind the other, then two side by side.
+fn close_pairs(height_mm: f64, material: &str) -> String {
+    let size_mm = [200.0, 150.0, height_mm];
+    let place = |x_mm: f64, y_mm: f64| parcel(size_mm, 0.0, [x_mm, y_mm], material);
+    let (behind_mm, beside_mm) = (200.0 + GAP_MM, 150.0 + GAP_MM);
+    [
+        place(-1400.0, 40.0),
+        place(-1400.0 - behind_mm, 40.0),
+        place(-2100.0, -0.5 * beside_mm),
+        place(-2115.0, 0.5 * beside_mm),
+    ]
+    .concat()
+}
+
+#[test]
+fn parcels_ten_mm_apart_are_two() {
+    for height_mm in [10.0, 60.0, 120.0] {
+        for fx_px in ["679.5", "996.6"] {
+            let text = close_pairs(height_mm, "kraft");
+            let scenario = scenario_seen_by(
+                &CAMERA.replace("679.5", fx_px).replace("679.9", fx_px),
+                180,
+                500.0,
+                &text,
+            );
+            let pairs = matched(&scenario, &measure(&scenario, 500.0));
+            assert_sizes(&pairs, FOOTPRINT_MM, HEIGHT_MM);
+        }
+    }
+}
+
+#[test]
+fn parcels_that_are_seen_apart_for_a_moment_are_two_and_say_that_they_were_merged() {
+    // White sides are as bright as other tops: only right under the camera is there a dark gap
+    // between these two.
+    let scenario = scenario(180, 500.0, &close_pairs(60.0, "white"));
+    let pairs = matched(&scenario, &measure(&scenario, 500.0));
+    assert_sizes(&pairs, FOOTPRINT_MM, HEIGHT_MM);
+    assert!(pairs[..2].iter().all(|(_, r)| r.flags.has(Flags::MERGED)), "{pairs:?}");
 }
 
 #[test]

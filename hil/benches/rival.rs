@@ -92,7 +92,8 @@ fn stages(scene: &Scene) -> Vec<Pair> {
         timed(&mut learn.ours, || background.step(rectify.pixels(), rectify.seen(), &hold));
         timed(&mut learn.theirs, || theirs.subtract());
         let (foreground, strong) = (background.foreground(), background.strong());
-        timed(&mut label.ours, || segment.step(foreground, strong));
+        let dark = background.dark();
+        timed(&mut label.ours, || segment.step(foreground, strong, dark));
         timed(&mut label.theirs, || theirs.label());
         timed(&mut floor.ours, || copy.copy_from_slice(&model));
         floor.theirs.push(*learn.ours.last().expect("timed"));

@@ -1,5 +1,8 @@
 //! Foreground mask -> blobs: opening, closing, run-based labels, fixed tables.
 //!
+//! Neighbours are told apart by what is bright: the gap between them is belt in shadow, or a dark
+//! side, which the mask holds and which the closing would fill.
+//!
 //! In: bit mask. Out: runs with labels, blobs with box and area. Owns: masks, run and blob
 //! tables. Limits: `limits.runs_max`, `limits.blobs_max`; what does not fit is counted.
 
@@ -11,6 +14,10 @@ use crate::plan::{Block, Memory, Plan};
 
 /// A blob with less of its area far from the background is a stain or a reflection.
 const STRONG_SHARE_MIN: f64 = 0.3;
+/// A bright piece is a parcel of its own, not a label or a stripe, from this share of its blob on ...
+const PIECE_SHARE_MIN: f64 = 0.08;
+/// ... when such pieces leave no more of the blob than gaps, shadows and dark sides.
+const PIECES_SHARE_MIN: f64 = 0.6;
 
 /// A connected piece of foreground, in belt view pixels.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
@@ -21,8 +28,16 @@ pub struct Blob {
     pub area_px: u32,
     /// Pixels far from the background: stains on the belt have few.
     pub strong_px: u32,
+    /// Pixels that cannot be a shadow.
+    pub bright_px: u32,
     /// Bounding box.
     pub bounds: PxBox,
+    /// Of a bright piece: label of the blob that it is part of.
+    pub whole: u32,
+    /// Of a blob: its bright pieces that may be parcels ...
+    pub pieces: u32,
+    /// ... and their pixels.
+    pub pieces_px: u32,
 }
 
 /// A box of pixels, ends included.
@@ -81,6 +96,7 @@ pub struct Segment {
     settings: Settings,
     area_min_px: u32,
     mask: Block<u64>,
+    bright: Block<u64>,
     scratch: Block<u64>,
     runs: Block<Run>,
     run_count: usize,
@@ -94,6 +110,7 @@ impl Segment {
     /// Memory for a view.
     pub fn plan([width, height]: [usize; 2], limits: &Limits, plan: &mut Plan) {
         plan.add::<u64>("segment.mask", words(width) * height, "mask after opening and closing");
+        plan.add::<u64>("segment.bright", words(width) * height, "foreground without dark parts");
         plan.add::<u64>("segment.scratch", words(width) * height, "the other half of each filter");
         plan.add::<Run>("segment.runs", limits.runs_max, "limits.runs_max");
         plan.add::<Blob>("segment.blobs", limits.blobs_max, "limits.blobs_max");
@@ -112,6 +129,7 @@ impl Segment {
             settings,
             area_min_px,
             mask: memory.take("segment.mask", 0)?,
+            bright: memory.take("segment.bright", 0)?,
             scratch: memory.take("segment.scratch", 0)?,
             runs: memory.take("segment.runs", Run::default())?,
             run_count: 0,
@@ -121,37 +139,69 @@ impl Segment {
         })
     }
 
-    /// Segment one mask; `strong` is its part that is beyond doubt.
-    pub fn step(&mut self, foreground: &[u64], strong: &[u64]) {
-        self.mask.copy_from_slice(foreground);
+    /// Segment one mask; `strong` is its part that is beyond doubt, `dark` what may be shadow.
+    pub fn step(&mut self, foreground: &[u64], strong: &[u64], dark: &[u64]) {
         let (open, close) = (self.settings.open_px, self.settings.close_px);
         let width = self.size_px[0];
+        for ((bright, all), dark) in self.bright.iter_mut().zip(foreground).zip(dark) {
+            *bright = all & !dark;
+        }
+        erode(&mut self.bright, &mut self.scratch, width, open);
+        dilate(&mut self.bright, &mut self.scratch, width, open);
+        self.mask.copy_from_slice(foreground);
         erode(&mut self.mask, &mut self.scratch, width, open);
         dilate(&mut self.mask, &mut self.scratch, width, open + close);
         erode(&mut self.mask, &mut self.scratch, width, close);
-        let found = collect(&self.mask, self.size_px[0], &mut self.runs);
+        let found = collect(&self.mask, width, &mut self.runs);
         self.run_count = found.min(self.runs.len());
-        let labels = resolve(&mut self.runs[..self.run_count]);
-        self.gather_blobs(labels, strong);
-        if found > self.runs.len() || labels > self.blobs.len() {
+        let (runs, rest) = self.runs.split_at_mut(self.run_count);
+        let labels = resolve(runs);
+        // Pieces follow in the same tables, their labels after those of the blobs.
+        let pieces_found = collect(&self.bright, width, rest);
+        let piece_runs = pieces_found.min(rest.len());
+        let piece_labels = resolve(&mut rest[..piece_runs]);
+        for run in &mut rest[..piece_runs] {
+            run.label += labels as u32;
+        }
+        self.gather_blobs(labels, piece_runs, labels + piece_labels, strong);
+        if found + pieces_found > self.runs.len() || labels + piece_labels > self.blobs.len() {
             self.overflows += 1;
         }
     }
 
-    fn gather_blobs(&mut self, labels: usize, strong: &[u64]) {
+    /// Blobs and their bright pieces; a blob of several pieces is replaced by them: parcels
+    /// side by side, joined by the shadow in the gap or by the closing.
+    fn gather_blobs(&mut self, wholes: usize, piece_runs: usize, labels: usize, strong: &[u64]) {
+        let n = words(self.size_px[0]);
         let count = labels.min(self.blobs.len());
+        let wholes = wholes.min(count);
         let blobs = &mut self.blobs[..count];
         for (label, blob) in blobs.iter_mut().enumerate() {
             *blob = Blob { label: label as u32, ..Blob::default() };
         }
-        for run in &self.runs[..self.run_count] {
+        let (runs, pieces) = self.runs[..self.run_count + piece_runs].split_at(self.run_count);
+        for run in runs.iter().chain(pieces) {
             let Some(blob) = blobs.get_mut(run.label as usize) else { continue };
             let (v, u0, u1) = (f32::from(run.v), f32::from(run.start), f32::from(run.end) - 1.0);
+            let row = usize::from(run.v) * n;
             blob.area_px += u32::from(run.end - run.start);
-            let row = &strong[usize::from(run.v) * words(self.size_px[0])..];
-            blob.strong_px += bits::count(row, run.start, run.end);
+            blob.strong_px += bits::count(&strong[row..], run.start, run.end);
+            blob.bright_px += bits::count(&self.bright[row..], run.start, run.end);
             blob.bounds = blob.bounds.union(&PxBox { u0, u1, v0: v, v1: v });
         }
+        // Runs of both are in the order of rows: a piece's lies in the last one before it.
+        let mut at = 0;
+        for run in pieces {
+            let from = (run.v, run.start);
+            while runs.get(at + 1).is_some_and(|next| (next.v, next.start) <= from) {
+                at += 1;
+            }
+            if let Some(piece) = blobs.get_mut(run.label as usize) {
+                piece.whole = runs.get(at).map_or(u32::MAX, |r| r.label);
+            }
+        }
+        self.replace_by_pieces(wholes, count);
+        let blobs = &mut self.blobs[..count];
         let mut kept = 0;
         for i in 0..count {
             let beyond_doubt =
@@ -161,7 +211,38 @@ impl Segment {
                 kept += 1;
             }
         }
+        self.run_count += piece_runs;
         self.blob_count = kept;
+    }
+
+    /// Where several bright pieces make up a blob, take its area from it; elsewhere, from them.
+    fn replace_by_pieces(&mut self, wholes: usize, count: usize) {
+        let area_min_px = self.area_min_px;
+        let is_piece = |piece: &Blob, whole: &Blob| {
+            piece.area_px >= area_min_px
+                && f64::from(piece.area_px) >= PIECE_SHARE_MIN * f64::from(whole.area_px)
+        };
+        let splits = |whole: &Blob| {
+            whole.pieces >= 2
+                && f64::from(whole.pieces_px) >= PIECES_SHARE_MIN * f64::from(whole.area_px)
+        };
+        let (whole_blobs, piece_blobs) = self.blobs[..count].split_at_mut(wholes);
+        for piece in piece_blobs.iter() {
+            let whole = whole_blobs.get_mut(piece.whole as usize);
+            if let Some(whole) = whole.filter(|whole| is_piece(piece, whole)) {
+                whole.pieces += 1;
+                whole.pieces_px += piece.area_px;
+            }
+        }
+        for piece in piece_blobs {
+            let whole = whole_blobs.get(piece.whole as usize);
+            if !whole.is_some_and(|whole| splits(whole) && is_piece(piece, whole)) {
+                piece.area_px = 0;
+            }
+        }
+        for whole in whole_blobs.iter_mut().filter(|whole| splits(whole)) {
+            whole.area_px = 0;
+        }
     }
 
     /// Blobs of at least the smallest area.
@@ -174,7 +255,7 @@ impl Segment {
         &self.mask
     }
 
-    /// All runs, row by row.
+    /// All runs: those of the blobs, row by row, then those of the bright pieces.
     pub fn runs(&self) -> &[Run] {
         &self.runs[..self.run_count]
     }
@@ -183,6 +264,37 @@ impl Segment {
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    /// Blobs of a 64 pixel wide mask: `#` bright, `s` dark.
+    fn blobs(rows: &[&str]) -> Vec<Blob> {
+        let size_px = [64, rows.len()];
+        let mut plan = Plan::default();
+        Segment::plan(size_px, &Limits::default(), &mut plan);
+        let mut memory = plan.reserve(8).expect("small");
+        let settings = Settings { area_min_mm2: 4.0, ..Settings::default() };
+        let mut segment = Segment::new(size_px, 1.0, settings, &mut memory).expect("planned");
+        let mask = |of: &str| -> Vec<u64> {
+            let bit = |(u, c): (usize, char)| u64::from(of.contains(c)) << u;
+            rows.iter().map(|row| row.char_indices().map(bit).sum()).collect()
+        };
+        segment.step(&mask("#s"), &mask("#s"), &mask("s"));
+        segment.blobs().to_vec()
+    }
+
+    #[test]
+    fn two_bright_pieces_joined_by_a_shadow_are_two_blobs() {
+        let found = blobs(&["  #########ss#########"; 4]);
+        let columns: Vec<[u32; 2]> =
+            found.iter().map(|b| [b.bounds.u0 as u32, b.bounds.u1 as u32]).collect();
+        assert_eq!(columns, [[2, 10], [13, 21]]);
+    }
+
+    #[test]
+    fn a_label_on_a_dark_parcel_and_a_shadow_beside_a_bright_one_split_nothing() {
+        for row in ["  ssssssssssssss###ss####", "  ##################ssssss"] {
+            assert_eq!(blobs(&[row; 4]).len(), 1, "{row}");
+        }
+    }
 
     #[test]
     fn boxes_overlap_where_they_share_pixels() {

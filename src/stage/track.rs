@@ -3,7 +3,8 @@
 //! In: blobs, travel since the last frame. Out: which track owns which blob; new, lost and
 //! departed tracks. Owns: the track table. Limits: `limits.tracks_max`; a parcel that finds
 //! it full is counted. A track counts only once it has moved with the belt: a ghost in the
-//! background or a hand does not.
+//! background or a hand does not. Neighbours that perspective or a shadow shows as one blob become
+//! two tracks once they have been seen apart.
 
 use super::segment::{Blob, PxBox};
 use crate::belt::BeltPosition;
@@ -32,6 +33,15 @@ const FRAGMENT_FRAMES: u32 = 8;
 const MERGED_FRAMES: u32 = 3;
 /// The end of several pieces follows the belt by at least the rest of this share.
 const LAG_SHARE: f32 = 0.5;
+/// A track with several large blobs over this travel, px, is several parcels, ...
+const SPLIT_TRAVEL_PX: f64 = 20.0;
+/// ... those of more than this share of its bright pixels ...
+const SPLIT_SHARE: f32 = 0.1;
+/// ... that are bright by this share: other blobs may be shadows.
+const SPLIT_BRIGHT_SHARE: f32 = 0.5;
+/// A track that was measured while it was apart is no mere piece of what it now runs together with,
+/// if its box is at least this share of it.
+const APART_SHARE: f32 = 0.2;
 /// Inside means this share of its box.
 const INSIDE_SHARE: f32 = 0.8;
 
@@ -70,6 +80,8 @@ pub struct Track {
     inside_frames: u32,
     /// Travel, px, since it was last seen.
     unseen_px: f64,
+    /// Travel, px, over which its blobs were several parcels'.
+    split_px: f64,
     first_bounds: PxBox,
 }
 
@@ -82,6 +94,7 @@ const FREE: Track = Track {
     merged_frames: 0,
     inside_frames: 0,
     unseen_px: 0.0,
+    split_px: 0.0,
     first_bounds: PxBox { u0: 0.0, u1: 0.0, v0: 0.0, v1: 0.0 },
 };
 
@@ -182,6 +195,9 @@ impl Tracker {
                 self.begin(blob, at);
             }
         }
+        for slot in 0..self.tracks.len() {
+            self.split(slot, blobs, step_px, at);
+        }
         self.judge(at);
     }
 
@@ -233,8 +249,10 @@ impl Tracker {
         let Some(blob) = hidden_by else { return };
         let owner = usize::from(self.owners[blob.label as usize]);
         let whole = self.tracks[owner].bounds.union(&blob.bounds);
+        let was_apart =
+            covers(slot, &bounds).is_some() && bounds.area() >= APART_SHARE * whole.area();
         let inside = covers(owner, &bounds) == Some(true)
-            || whole.overlap(&bounds) >= INSIDE_SHARE * bounds.area();
+            || !was_apart && whole.overlap(&bounds) >= INSIDE_SHARE * bounds.area();
         let track = &mut self.tracks[slot];
         track.inside_frames = if inside { track.inside_frames + 1 } else { 0 };
         let young = track.frames < YOUNG_FRAMES && track.phase == Phase::Candidate;
@@ -276,6 +294,39 @@ impl Tracker {
         }
     }
 
+    /// A track whose blobs have been several parcels' for long enough becomes several tracks. What
+    /// was seen of them together is of no use to any of them.
+    fn split(&mut self, slot: usize, blobs: &[Blob], step_px: f64, at: BeltPosition) {
+        let track = &mut self.tracks[slot];
+        if !matches!(track.phase, Phase::Candidate | Phase::Riding) {
+            return;
+        }
+        let bright = |b: &Blob| b.bright_px as f32;
+        let owned = |owners: &[u16], b: &&Blob| owners[b.label as usize] == slot as u16;
+        let total: f32 = blobs.iter().filter(|b| owned(&self.owners, b)).map(bright).sum();
+        let is_parcel = |b: &&Blob| {
+            bright(b) > SPLIT_SHARE * total && bright(b) >= SPLIT_BRIGHT_SHARE * b.area_px as f32
+        };
+        let mut parcels = blobs.iter().filter(|b| owned(&self.owners, b)).filter(is_parcel);
+        let (Some(first), Some(_)) = (parcels.next(), parcels.next()) else {
+            track.split_px = 0.0;
+            return;
+        };
+        track.split_px += step_px.abs();
+        if track.split_px < SPLIT_TRAVEL_PX {
+            return;
+        }
+        let (bounds, phase) = (first.bounds, track.phase);
+        *track = Track { phase, bounds, first: at, first_bounds: bounds, ..FREE };
+        let _ = self.changes.push((slot, Change::Began));
+        for blob in blobs.iter().filter(is_parcel) {
+            if owned(&self.owners, &blob) && blob.label != first.label {
+                self.owners[blob.label as usize] = NOBODY;
+                self.begin(blob, at);
+            }
+        }
+    }
+
     fn begin(&mut self, blob: &Blob, at: BeltPosition) {
         let Some(slot) = self.tracks.iter().position(|t| t.phase == Phase::Free) else {
             self.overflows += 1;
@@ -289,7 +340,7 @@ impl Tracker {
             ..FREE
         };
         self.owners[blob.label as usize] = slot as u16;
-        // 256 tracks can begin and be lost once each: 512 changes at most.
+        // 256 tracks can begin and be lost once each: 512 changes; more are split ones.
         let _ = self.changes.push((slot, Change::Began));
     }
 
@@ -368,8 +419,9 @@ mod tests {
                 .enumerate()
                 .map(|(label, &[u0, u1, v0, v1])| Blob {
                     label: label as u32,
-                    area_px: ((u1 - u0) * (v1 - v0)) as u32,
                     bounds: PxBox { u0, u1, v0, v1 },
+                    area_px: PxBox { u0, u1, v0, v1 }.area() as u32,
+                    bright_px: PxBox { u0, u1, v0, v1 }.area() as u32,
                     ..Blob::default()
                 })
                 .collect();
@@ -459,6 +511,38 @@ mod tests {
         belt.frame(STEP_MM, &[at(140.0, 0.0), at(140.0, 60.0)]);
         assert_eq!(belt.phases(), [Phase::Riding, Phase::Riding, Phase::Free]);
         assert!(belt.tracker.tracks()[..2].iter().any(Track::was_merged));
+    }
+
+    #[test]
+    fn one_that_turns_out_to_be_two_becomes_two_and_is_measured_anew() {
+        let mut belt = Belt::new();
+        for i in 0..10u8 {
+            let u = f32::from(i) * 10.0;
+            belt.frame(STEP_MM, &[[u, u + 60.0, 0.0, 86.0]]);
+        }
+        assert_eq!(belt.phases(), [Phase::Riding, Phase::Free, Phase::Free]);
+        let mut began = 0;
+        for i in 10..16u8 {
+            let u = f32::from(i) * 10.0;
+            belt.frame(STEP_MM, &[at(u, 0.0), at(u, 46.0)]);
+            began += belt.tracker.changes().iter().filter(|c| c.1 == Change::Began).count();
+        }
+        assert_eq!((began, belt.phases()), (2, [Phase::Riding, Phase::Riding, Phase::Free]));
+    }
+
+    #[test]
+    fn a_moment_apart_or_a_small_piece_splits_nothing() {
+        let mut belt = Belt::new();
+        for i in 0..30u8 {
+            let u = f32::from(i) * 10.0;
+            match i {
+                20 => belt.frame(STEP_MM, &[at(u, 0.0), at(u, 46.0)]),
+                21..30 => belt
+                    .frame(STEP_MM, &[[u, u + 60.0, 0.0, 80.0], [u + 40.0, u + 46.0, 80.0, 86.0]]),
+                _ => belt.frame(STEP_MM, &[[u, u + 60.0, 0.0, 86.0]]),
+            }
+        }
+        assert_eq!(belt.phases(), [Phase::Riding, Phase::Free, Phase::Free]);
     }
 
     #[test]
