@@ -156,7 +156,7 @@ impl Pipeline {
             self.odometry.step(self.rectify.pixels(), &self.background, &self.covered, dt_s);
         self.at.advance(motion.step_mm, motion.measured);
         self.track(motion.step_mm);
-        self.measure_tracks(time);
+        self.measure_tracks(time, motion.step_mm);
         self.report(emit);
         self.counters.segment_overflows = self.segment.overflows;
         self.counters.track_overflows = self.tracker.overflows;
@@ -221,7 +221,7 @@ impl Pipeline {
         tracker.step(segment.blobs(), step_mm, *at, &covers);
     }
 
-    fn measure_tracks(&mut self, time: FrameTime) {
+    fn measure_tracks(&mut self, time: FrameTime, step_mm: f64) {
         for &(slot, change) in self.tracker.changes() {
             if change == Change::Began {
                 self.measure.begin(slot, self.at);
@@ -246,6 +246,7 @@ impl Pipeline {
                 !track.merged && owners.get(run.label as usize) == Some(&(slot as u16))
             });
             self.measure.observe(slot, self.at, &frame, alone);
+            self.measure.search(slot, self.at, step_mm);
             let reference = &mut self.references[slot];
             if !reference.fixed {
                 let outline = self.measure.outline(slot, self.at);

@@ -43,6 +43,16 @@ struct Minor {
     weight: Block<u8>,
 }
 
+/// Pixels of about the same brightness ratio.
+#[derive(Clone, Copy, Default)]
+struct GainBin {
+    votes: u32,
+    /// Sum of their grey levels.
+    scene: u32,
+    /// Sum of their means, Q7.
+    model: u32,
+}
+
 /// The background stage.
 pub struct Background {
     level: Level,
@@ -55,7 +65,7 @@ pub struct Background {
     foreground: Block<u64>,
     dark: Block<u64>,
     strong: Block<u64>,
-    gain_histogram: Block<u32>,
+    gain_histogram: Block<GainBin>,
     gain_step_px: usize,
     /// Model brightness over scene brightness, Q15.
     gain_q15: u32,
@@ -77,7 +87,7 @@ impl Background {
         plan.add::<u64>("background.foreground", words, "bit: foreground");
         plan.add::<u64>("background.dark", words, "bit: foreground or deep shadow");
         plan.add::<u64>("background.strong", words, "bit: far from the background");
-        plan.add::<u32>("background.gain", GAIN_BINS, "histogram of brightness ratios");
+        plan.add::<GainBin>("background.gain", GAIN_BINS, "histogram of brightness ratios");
     }
 
     /// An empty model.
@@ -108,7 +118,7 @@ impl Background {
             foreground: memory.take("background.foreground", 0)?,
             dark: memory.take("background.dark", 0)?,
             strong: memory.take("background.strong", 0)?,
-            gain_histogram: memory.take("background.gain", 0)?,
+            gain_histogram: memory.take("background.gain", GainBin::default())?,
             gain_step_px: (width * height / GAIN_VOTES).isqrt().max(1),
             gain_q15: GAIN_ONE,
             frames: 0,
@@ -166,38 +176,36 @@ impl Background {
     /// the mean of the ratios near it is the gain. What was foreground does not vote.
     fn estimate_gain(&mut self, grey: &[u8], seen: &[u64]) -> u32 {
         let (n, stride, step) = (words(self.width), stride(self.width), self.gain_step_px);
-        let (mean, foreground, width) = (&self.mean, &self.foreground, self.width);
-        let votes = || {
-            let rows = (0..mean.len() / stride).step_by(step);
-            let places = rows.flat_map(|v| (0..width).step_by(step).map(move |u| (u, v)));
-            places.filter_map(|(u, v)| {
-                let (grey, model) = (grey[v * stride + u], mean[v * stride + u]);
-                let word = v * n + u / 64;
-                let is_belt = (seen[word] & !foreground[word]) >> (u % 64) & 1 == 1;
-                let bin = u32::from(grey) * 128 * GAIN_BIN_ONE / u32::from(model.max(1));
-                let bin = (bin as usize).min(GAIN_BINS - 1);
-                (is_belt && model >= GAIN_MEAN_MIN).then_some((grey, model, bin))
-            })
-        };
         let histogram = &mut self.gain_histogram;
-        histogram.fill(0);
+        histogram.fill(GainBin::default());
         let mut count = 0;
-        for (_, _, bin) in votes() {
-            histogram[bin] += 1;
-            count += 1;
+        for v in (0..self.mean.len() / stride).step_by(step) {
+            for u in (0..self.width).step_by(step) {
+                let (scene, model) = (grey[v * stride + u], self.mean[v * stride + u]);
+                let word = v * n + u / 64;
+                let is_belt = (seen[word] & !self.foreground[word]) >> (u % 64) & 1 == 1;
+                if is_belt && model >= GAIN_MEAN_MIN {
+                    let ratio = u32::from(scene) * 128 * GAIN_BIN_ONE / u32::from(model);
+                    let bin = &mut histogram[(ratio as usize).min(GAIN_BINS - 1)];
+                    bin.votes += 1;
+                    bin.scene += u32::from(scene);
+                    bin.model += u32::from(model);
+                    count += 1;
+                }
+            }
         }
         let mut below = 0;
-        let median = histogram.iter().position(|&votes| {
-            below += votes;
+        let median = histogram.iter().position(|bin| {
+            below += bin.votes;
             below * 2 > count
         });
         let Some(median) = median else { return self.gain_q15 };
+        let near =
+            median.saturating_sub(GAIN_BINS_NEAR)..GAIN_BINS.min(median + GAIN_BINS_NEAR + 1);
         let (mut scene, mut model) = (0u64, 0u64);
-        for (grey, mean, bin) in votes() {
-            if bin.abs_diff(median) <= GAIN_BINS_NEAR {
-                scene += u64::from(grey);
-                model += u64::from(mean);
-            }
+        for bin in &histogram[near] {
+            scene += u64::from(bin.scene);
+            model += u64::from(bin.model);
         }
         // Both sums are over the same pixels; the model is in Q7.
         let gain = model * u64::from(GAIN_ONE) / (scene * 128).max(1);

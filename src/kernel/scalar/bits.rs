@@ -54,22 +54,44 @@ fn for_words(start: u16, end: u16, mut visit: impl FnMut(usize, u64)) {
 /// Widen every shape of a mask, rows of `width` pixels, by a square of `radius` to all sides.
 /// `scratch` has the mask's size. `radius` is at most 63.
 pub fn dilate(mask: &mut [u64], scratch: &mut [u64], width: usize, radius: usize) {
-    filter(mask, scratch, width, radius, 0);
+    let Some(rows) = along_rows(mask, scratch, width, radius, 0) else { return };
+    across_rows(
+        mask,
+        scratch,
+        width,
+        radius,
+        (rows.start.saturating_sub(radius), rows.end + radius),
+        0,
+    );
 }
 
 /// Narrow every shape: the dilation of the complement, complemented.
 pub fn erode(mask: &mut [u64], scratch: &mut [u64], width: usize, radius: usize) {
-    filter(mask, scratch, width, radius, u64::MAX);
+    let Some(rows) = along_rows(mask, scratch, width, radius, u64::MAX) else { return };
+    across_rows(mask, scratch, width, radius, (rows.start, rows.end), u64::MAX);
 }
 
-/// Dilation of `mask ^ flip`, written `^ flip`: along the rows, then across them.
-fn filter(mask: &mut [u64], scratch: &mut [u64], width: usize, radius: usize, flip: u64) {
+/// Dilate each row of `mask ^ flip` into `out`, `^ flip`. Returns the rows that are not empty; `None`
+/// when there is nothing to do.
+fn along_rows(
+    mask: &[u64],
+    out: &mut [u64],
+    width: usize,
+    radius: usize,
+    flip: u64,
+) -> Option<std::ops::Range<usize>> {
     let n = words(width);
     if n == 0 || radius == 0 {
-        return;
+        return None;
     }
     let last = last_word_mask(width);
-    for (row, out) in mask.chunks_exact(n).zip(scratch.chunks_exact_mut(n)) {
+    let mut rows: Option<std::ops::Range<usize>> = None;
+    for (y, (row, out)) in mask.chunks_exact(n).zip(out.chunks_exact_mut(n)).enumerate() {
+        if row.iter().all(|&word| word == 0) {
+            out.fill(0);
+            continue;
+        }
+        rows = Some(rows.map_or(y, |rows| rows.start)..y + 1);
         let word = |w: usize| {
             let valid = if w + 1 == n { last } else { u64::MAX };
             row.get(w).map_or(0, |bits| (bits ^ flip) & valid)
@@ -77,23 +99,38 @@ fn filter(mask: &mut [u64], scratch: &mut [u64], width: usize, radius: usize, fl
         let (mut before, mut here) = (0, word(0));
         for (w, out) in out.iter_mut().enumerate() {
             let after = word(w + 1);
-            *out = spread([before, here, after], radius);
+            *out = spread([before, here, after], radius) ^ flip;
             (before, here) = (here, after);
         }
+        out[n - 1] &= last;
     }
+    rows
+}
+
+/// Dilate each column of `src ^ flip` into `mask`, `^ flip`; outside of rows `from..to` there is
+/// nothing.
+fn across_rows(
+    mask: &mut [u64],
+    src: &[u64],
+    width: usize,
+    radius: usize,
+    (from, to): (usize, usize),
+    flip: u64,
+) {
+    let n = words(width);
     let rows = mask.len() / n;
     for (y, out) in mask.chunks_exact_mut(n).enumerate() {
+        if y < from || y >= to {
+            out.fill(0);
+            continue;
+        }
         let near = y.saturating_sub(radius)..(y + radius + 1).min(rows);
-        out.fill(0);
-        for row in scratch[near.start * n..near.end * n].chunks_exact(n) {
+        out.copy_from_slice(&src[y * n..(y + 1) * n]);
+        for row in src[near.start * n..near.end * n].chunks_exact(n) {
             for (out, bits) in out.iter_mut().zip(row) {
-                *out |= bits;
+                *out = ((*out ^ flip) | (bits ^ flip)) ^ flip;
             }
         }
-        for out in &mut *out {
-            *out ^= flip;
-        }
-        out[n - 1] &= last;
     }
 }
 

@@ -122,8 +122,8 @@ pub const VARIANCE_NEW: u16 = 25 << 10;
 pub const VARIANCE_MIN: u16 = 1480;
 /// Below this a mean cannot carry a ratio: 6 grey levels, Q7.
 pub const SHADOW_MEAN_MIN: u16 = 6 << 7;
-/// Complexity prior `c_T` of eq. 14, as a share of the weight: 1/32 of 255.
-pub const PRIOR: u16 = 8;
+/// Complexity prior `c_T` of eq. 14: 0.05 of 255.
+pub const PRIOR: u16 = 13;
 
 /// Bits that the mean's unit has more than that of [`distance`].
 pub const MEAN_GAINED: u32 = 4;
@@ -273,7 +273,8 @@ impl Pixel {
         self.minors.iter().fold(255, |left: u8, m| left.saturating_sub(m.weight))
     }
 
-    fn learn(&mut self, x: u16, params: &Params) {
+    /// Learn observation `x`, whatever its class.
+    pub fn learn(&mut self, x: u16, params: &Params) {
         let near = |m: &Minor| m.weight > 0 && within(x, m.mean, m.variance_q10(), MATCH_Q8);
         let main = within(x, self.mean, self.variance, MATCH_Q8);
         let minor = if main { None } else { self.minors.iter().position(near) };
@@ -304,9 +305,14 @@ impl Pixel {
         };
     }
 
-    /// A new mode takes the place of the weakest.
+    /// A new mode takes the place of the weakest. At a rate below 1/255 it has a weight in some
+    /// frames only.
     fn insert(&mut self, x: u16, rate: &Rate) {
-        let weight = ((rate.q16() * 255) >> 16).clamp(1, 255) as u8;
+        let (mantissa, shift, dither) = rate.for_weight();
+        let weight = ((255 * mantissa + dither) >> shift) as u8;
+        if weight == 0 {
+            return;
+        }
         let free = self.minors.iter().position(|m| m.weight == 0).unwrap_or(MINORS - 1);
         let variance = (VARIANCE_NEW >> VARIANCE_GAINED) as u8;
         self.minors[free] = Minor { mean: x, variance, weight };
@@ -435,12 +441,12 @@ mod tests {
     #[test]
     fn a_mode_seen_once_is_soon_removed() {
         let mut pixel = learned(100);
-        update(observation(200, Gain::ONE), &mut pixel, true, &params(500, 0));
+        update(observation(200, Gain::ONE), &mut pixel, true, &params(500, 1));
         assert!(pixel.is_multiple());
         for n in 0..200 {
             update(observation(100, Gain::ONE), &mut pixel, true, &params(500, n));
         }
-        // The prior takes 1 of 255 every 60 frames.
+        // The prior takes 1 of 255 every 36 frames.
         assert!(!pixel.is_multiple());
     }
 

@@ -1,13 +1,13 @@
-//! [`crate::kernel::scalar::mixture`] for 64 pixels at once: what belongs to the main mode is
-//! learned in vectors, what does not is classified in vectors, and the few pixels that have or
-//! need a second mode are left to the specification.
+//! [`crate::kernel::scalar::mixture`] for 64 pixels at once: all are classified in vectors, those
+//! that belong to their main mode are learned in vectors, and the few that belong to a weaker
+//! mode, or need one, are left to the specification.
 //!
 //! Cost: 1 byte of image, 4 of model read and 4 written a pixel of the common kind; 2 more of
 //! each in a block that has a pixel with a second mode.
 
 use crate::kernel::scalar::mixture::{
-    Class, Gain, MATCH_Q8, MEAN_GAINED, MINORS, Minor, PRIOR, Params, Pixel, SHADOW_MEAN_MIN,
-    VARIANCE_GAINED, VARIANCE_MIN, is_strong, observation, update as update_pixel,
+    Gain, MATCH_Q8, MEAN_GAINED, MINORS, Minor, PRIOR, Params, Pixel, SHADOW_MEAN_MIN,
+    VARIANCE_GAINED, VARIANCE_MIN, observation,
 };
 use fearless_simd::{Level, dispatch, prelude::*};
 
@@ -41,6 +41,14 @@ pub struct Minors<'a> {
 impl Minors<'_> {
     fn get(&self, i: usize) -> Minor {
         Minor { mean: self.mean[i], variance: self.variance[i], weight: self.weight[i] }
+    }
+
+    fn block(&self, pixels: &std::ops::Range<usize>) -> MinorBlock<'_> {
+        MinorBlock {
+            mean: &self.mean[pixels.clone()],
+            variance: &self.variance[pixels.clone()],
+            weight: &self.weight[pixels.clone()],
+        }
     }
 
     fn set(&mut self, i: usize, minor: Minor) {
@@ -93,9 +101,17 @@ fn update_blocks<S: Simd>(
         } else {
             follow::<S, false>(simd, grey, mean, variance, !hold, params)
         };
-        let mut found = Found::default();
+        let mut shade = Shade::default();
         if within != u64::MAX {
-            found = shade(simd, grey, mean, variance, !within, params);
+            shade = main_shade(simd, grey, mean, variance, params);
+            shade.background = within;
+            if *multiple & !within != 0 {
+                let pixels = w * BLOCK..(w + 1) * BLOCK;
+                let [first, second] = &model.minors;
+                let minors = [first.block(&pixels), second.block(&pixels)];
+                add_minor_shades(simd, grey, &minors, params, &mut shade);
+            }
+            shade.settle();
         }
         // Where the main mode learns, the weaker ones fade.
         let fading = near & *multiple & !hold;
@@ -105,26 +121,41 @@ fn update_blocks<S: Simd>(
                 | fade(simd, &mut second.weight[w * BLOCK..][..BLOCK], fading, params);
             *multiple = (*multiple & !fading) | (lasting & fading);
         }
-        // A pixel of its own: it may belong to a second mode, or needs one.
-        let alone = !near & (*multiple | (!hold & !found.shadow));
+        // A weaker mode learns, or a new one begins.
+        let alone = !(near | hold | shade.shadow);
         if alone != 0 {
             let (main, minors) = ([mean, variance], &mut model.minors);
-            let more = one_by_one(&mut found, alone, hold, grey, main, minors, w * BLOCK, params);
+            let more = learn_one_by_one(alone, grey, main, minors, w * BLOCK, params);
             *multiple = (*multiple & !alone) | more;
         }
-        masks.foreground[w] = found.foreground;
-        masks.dark[w] = found.dark;
-        masks.strong[w] = found.strong;
+        let foreground = if within == u64::MAX { 0 } else { shade.foreground() };
+        masks.foreground[w] = foreground;
+        masks.dark[w] = shade.dark & foreground;
+        masks.strong[w] = shade.strong & foreground;
     }
 }
 
-/// Bits of a block.
+/// What the pixels of a block are, as bits.
 #[derive(Clone, Copy, Default)]
-struct Found {
-    foreground: u64,
+struct Shade {
+    background: u64,
     shadow: u64,
     dark: u64,
     strong: u64,
+}
+
+impl Shade {
+    /// The lightest shade counts: any mode's background, any mode's shadow, any mode's dark.
+    #[inline(always)]
+    fn settle(&mut self) {
+        self.shadow &= !self.background;
+        self.dark &= !(self.background | self.shadow);
+    }
+
+    #[inline(always)]
+    fn foreground(&self) -> u64 {
+        !(self.background | self.shadow)
+    }
 }
 
 /// Let the weights of the pixels of `fading` fade; returns which are not zero.
@@ -147,13 +178,10 @@ fn fade<S: Simd>(simd: S, weights: &mut [u8], fading: u64, params: &Params) -> u
     lasting
 }
 
-/// The specification for the pixels of `alone`, a block that begins at pixel `from`; returns which
-/// of them have a second mode.
-#[expect(clippy::too_many_arguments, reason = "a block's parts, as they are borrowed")]
-fn one_by_one(
-    found: &mut Found,
+/// The specification's learning for the pixels of `alone`, a block that begins at pixel `from`;
+/// returns which of them have a second mode.
+fn learn_one_by_one(
     alone: u64,
-    hold: u64,
     grey: &[u8; BLOCK],
     [mean, variance]: [&mut [u16; BLOCK]; 2],
     [first, second]: &mut [Minors<'_>; MINORS],
@@ -164,25 +192,14 @@ fn one_by_one(
     let mut left = alone;
     while left != 0 {
         let i = left.trailing_zeros() as usize;
-        let bit = 1 << i;
         left &= left - 1;
         let minors = [first.get(from + i), second.get(from + i)];
         let mut pixel = Pixel { mean: mean[i], variance: variance[i], minors };
-        let x = observation(grey[i], params.gain);
-        let strong = is_strong(x, &pixel, params);
-        let class = update_pixel(x, &mut pixel, hold & bit == 0, params);
+        pixel.learn(observation(grey[i], params.gain), params);
         (mean[i], variance[i]) = (pixel.mean, pixel.variance);
         first.set(from + i, pixel.minors[0]);
         second.set(from + i, pixel.minors[1]);
-        let is_foreground = matches!(class, Class::Foreground | Class::Dark);
-        for (mask, on) in [
-            (&mut found.foreground, is_foreground),
-            (&mut found.dark, class == Class::Dark),
-            (&mut found.strong, is_foreground && strong),
-            (&mut multiple, pixel.is_multiple()),
-        ] {
-            *mask = (*mask & !bit) | if on { bit } else { 0 };
-        }
+        multiple |= u64::from(pixel.is_multiple()) << i;
     }
     multiple
 }
@@ -255,46 +272,98 @@ fn follow<S: Simd, const ALL: bool>(
     (all_within, all_near)
 }
 
-/// Classes of the pixels of `outside`, which do not belong to their main mode.
+/// How much darker than a mode's mean: bits of shadow, and of shadow or dark.
 #[inline(always)]
-fn shade<S: Simd>(
+fn darker<S: Simd>(x: S::u16s, mean: S::u16s, params: &Params) -> (S::mask16s, S::mask16s) {
+    let darker = x.simd_lt(mean) & mean.simd_ge(SHADOW_MEAN_MIN);
+    let shadow = x.simd_ge(part_of::<S>(mean, params.shadow_ratio_q8));
+    let dark = x.simd_ge(part_of::<S>(mean, params.dark_ratio_q8));
+    (darker & shadow, darker & (shadow | dark))
+}
+
+/// Shades against the main modes.
+#[inline(always)]
+fn main_shade<S: Simd>(
     simd: S,
     grey: &[u8; BLOCK],
     mean: &[u16; BLOCK],
     variance: &[u16; BLOCK],
-    outside: u64,
     params: &Params,
-) -> Found {
+) -> Shade {
     let n = S::u16s::LEN;
-    let mut found = Found::default();
+    let mut shade = Shade::default();
     for at in (0..BLOCK).step_by(2 * n) {
         let grey = S::u8s::from_slice(simd, &grey[at..at + 2 * n]);
         let [low, high] = observe::<S>(grey, params);
         for (at, x) in [(at, low), (at + n, high)] {
             let m = S::u16s::from_slice(simd, &mean[at..at + n]);
             let v = S::u16s::from_slice(simd, &variance[at..at + n]);
-            let darker = x.simd_lt(m) & m.simd_ge(SHADOW_MEAN_MIN);
-            let shadow = darker & x.simd_ge(part_of::<S>(m, params.shadow_ratio_q8));
-            let dark = darker & x.simd_ge(part_of::<S>(m, params.dark_ratio_q8)) & !shadow;
+            let (shadow, dark) = darker::<S>(x, m, params);
             let distance = (abs_diff::<S>(x, m) >> 4).min(255);
             let half_reach = ((distance * params.reach_q8) >> 6).min(255) >> 1;
-            let strong = (half_reach * half_reach).simd_ge(v);
-            found.shadow |= shadow.to_bitmask() << at;
-            found.dark |= dark.to_bitmask() << at;
-            found.strong |= strong.to_bitmask() << at;
+            shade.shadow |= shadow.to_bitmask() << at;
+            shade.dark |= dark.to_bitmask() << at;
+            shade.strong |= (half_reach * half_reach).simd_ge(v).to_bitmask() << at;
         }
     }
-    found.shadow &= outside;
-    found.foreground = outside & !found.shadow;
-    found.dark &= found.foreground;
-    found.strong &= found.foreground;
-    found
+    shade
+}
+
+/// A weaker mode of a block.
+struct MinorBlock<'a> {
+    mean: &'a [u16],
+    variance: &'a [u8],
+    weight: &'a [u8],
+}
+
+/// Shades against those weaker modes that are background.
+#[inline(always)]
+fn add_minor_shades<S: Simd>(
+    simd: S,
+    grey: &[u8; BLOCK],
+    minors: &[MinorBlock<'_>; MINORS],
+    params: &Params,
+    shade: &mut Shade,
+) {
+    let n = S::u16s::LEN;
+    for at in (0..BLOCK).step_by(2 * n) {
+        let bytes = at..at + 2 * n;
+        let seen = observe::<S>(S::u8s::from_slice(simd, &grey[bytes.clone()]), params);
+        let weights = [
+            S::u8s::from_slice(simd, &minors[0].weight[bytes.clone()]),
+            S::u8s::from_slice(simd, &minors[1].weight[bytes.clone()]),
+        ];
+        // What the modes before it hold.
+        let main = S::u8s::splat(simd, 255).saturating_sub(weights[0]).saturating_sub(weights[1]);
+        let shares = [main, main.saturating_add(weights[0])];
+        let mut counts = u64::MAX;
+        for k in 0..MINORS {
+            let exists = weights[k].simd_gt(0) & shares[k].simd_lt(params.background_share);
+            // Without one mode there is none after it.
+            counts &= exists.to_bitmask();
+            let (low, high) = S::u8s::from_slice(simd, &minors[k].variance[bytes.clone()]).widen();
+            for (half, v) in [low, high].into_iter().enumerate() {
+                let (x, at) = (seen[half], at + half * n);
+                let m = S::u16s::from_slice(simd, &minors[k].mean[at..at + n]);
+                let distance = (abs_diff::<S>(x, m) >> 4).min(255);
+                let reach = ((distance * params.reach_q8) >> 6).min(255);
+                let within = (reach * reach).simd_lt(v << VARIANCE_GAINED);
+                let (shadow, dark) = darker::<S>(x, m, params);
+                let counts = counts >> (half * n);
+                shade.background |= (within.to_bitmask() & counts) << at;
+                shade.shadow |= (shadow.to_bitmask() & counts) << at;
+                shade.dark |= (dark.to_bitmask() & counts) << at;
+            }
+        }
+    }
 }
 
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::kernel::scalar::mixture::{Rate, VARIANCE_NEW};
+    use crate::kernel::scalar::mixture::{
+        Class, Rate, VARIANCE_NEW, is_strong, update as update_pixel,
+    };
     use crate::kernel::simd::each_level;
 
     const BLOCKS: usize = 3;

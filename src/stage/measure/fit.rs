@@ -11,7 +11,7 @@ use super::model::{
     YAW, canonical, direction,
 };
 use super::observe::{EdgeSample, PassView};
-use super::votes::{FaceVote, RISING_TRUST, SLOPE_ENOUGH, choose};
+use super::votes::{RISING_TRUST, SLOPE_ENOUGH, choose};
 use crate::camera::BeltView;
 use crate::units::BeltRect;
 use nalgebra::{SMatrix, SVector, Vector2};
@@ -23,7 +23,7 @@ const REACH_GUARD_SIGMA_MM: f64 = 12.0;
 /// Edges are good to a third of a pixel; more is modelling error.
 const EDGE_SIGMA_PX: f64 = 0.35;
 /// The gate around a predicted edge, px, closing with the iterations.
-const GATES_PX: [f64; 12] = [6.0, 6.0, 5.0, 4.0, 3.0, 2.5, 2.0, 2.0, 2.0, 2.0, 2.0, 2.0];
+pub(super) const GATES_PX: [f64; 12] = [6.0, 6.0, 5.0, 4.0, 3.0, 2.5, 2.0, 2.0, 2.0, 2.0, 2.0, 2.0];
 /// From here on the gates suit a start that was found among others.
 const NEAR_GATE: usize = 4;
 /// An edge's polarity is settled once the gate is this narrow, px.
@@ -180,7 +180,7 @@ impl Problem<'_> {
     }
 
     /// The same on as many views as are enough to choose a start.
-    fn search(&self, views: &[PassView]) -> Self {
+    pub(super) fn on_some_of(&self, views: &[PassView]) -> Self {
         Self { view_stride: (views.len() / SEARCH_VIEWS).max(1), ..*self }
     }
 
@@ -189,23 +189,21 @@ impl Problem<'_> {
         views.iter().filter(|v| !v.samples().is_empty()).step_by(self.view_stride)
     }
 
-    /// Fit silhouettes only, from `start` or from scratch.
+    /// Fit silhouettes only, from `start`, near as it is, or from scratch.
     pub fn fit_reach(&self, views: &[PassView], start: Option<Params>) -> Option<Estimate> {
-        let candidates = match start {
-            Some(params) => [Some(params), None, None],
-            None => [0.1, 0.35, 0.75].map(|share| self.start(views, share * self.height_max_mm)),
-        };
-        let search = self.search(views);
-        let mut best: Option<(f64, Params)> = None;
-        for candidate in candidates.into_iter().flatten() {
-            let (cost, params) = search.descend(views, candidate, 8);
-            if cost.is_finite() && best.is_none_or(|(c, _)| cost < c) {
-                best = Some((cost, params));
-            }
-        }
-        let (_, params) = self.descend(views, best?.1, 4);
+        let start = start.or_else(|| self.on_some_of(views).reach_start(views))?;
+        let (_, params) = self.descend(views, start, 4);
         let (normal, reach_error) = self.reach_normal(views, &params);
         self.estimate(params, &normal, reach_error, &EdgeUse::default())
+    }
+
+    /// The best of starts of different height.
+    fn reach_start(&self, views: &[PassView]) -> Option<Params> {
+        let heights = [0.1, 0.35, 0.75].map(|share| share * self.height_max_mm);
+        let starts = heights.into_iter().filter_map(|mm| self.start(views, mm));
+        let ends = starts.map(|start| self.descend(views, start, 8));
+        let finite = ends.filter(|(cost, _)| cost.is_finite());
+        finite.min_by(|a, b| a.0.total_cmp(&b.0)).map(|(_, params)| params)
     }
 
     /// The smallest upright cuboid that holds the silhouettes, as high as the highest texture.
@@ -219,49 +217,13 @@ impl Problem<'_> {
         Some(estimate)
     }
 
-    /// Fit edges, starting from an estimate of the silhouettes: the best of several starts, tried
-    /// on some of the views, then on all of them.
+    /// Fit edges on all views from a start that was searched.
     pub fn fit_edges(&self, views: &[PassView], start: Params) -> Option<Estimate> {
-        let found = self.face_votes(views, &start);
-        let start = self.search(views).search_edges(views, start, &found)?.params;
         self.refine_edges(views, start, &GATES_PX[NEAR_GATE..])
     }
 
-    /// On a side that faces the camera the strongest edge may be the top one or the one on the
-    /// belt: both are tried, and the cuboid that explains more contrast is kept.
-    fn search_edges(
-        &self,
-        views: &[PassView],
-        start: Params,
-        found: &[FaceVote; 4],
-    ) -> Option<Estimate> {
-        // Without shadows the silhouette itself is near enough.
-        let mut best = self.refine_edges(views, start, &GATES_PX);
-        for as_base in 0..16u8 {
-            let takes = |k: usize| as_base >> k & 1 == 1;
-            if (0..4).any(|k| takes(k) && found[k].side_depth_mm.is_none()) {
-                continue;
-            }
-            let offsets = std::array::from_fn(|k| {
-                let depth = if takes(k) { found[k].side_depth_mm } else { None };
-                found[k].offset_mm - depth.unwrap_or(0.0)
-            });
-            let fitted = self.refine_edges(views, self.moved(start, offsets), &GATES_PX);
-            let score = |e: &Option<Estimate>| e.map_or(f64::NEG_INFINITY, |e| e.score());
-            if score(&fitted) > score(&best) {
-                best = fitted;
-            }
-        }
-        best
-    }
-
-    /// The same cuboid's fit without the corners.
-    pub fn without_corners(&self, views: &[PassView], both: &Estimate) -> Option<Estimate> {
-        Self { top_motion: None, ..*self }.refine_edges(views, both.params, &GATES_PX[NEAR_GATE..])
-    }
-
     /// Gauss-Newton on the edges, the gate closing.
-    fn refine_edges(
+    pub(super) fn refine_edges(
         &self,
         views: &[PassView],
         start: Params,
@@ -288,7 +250,7 @@ impl Problem<'_> {
     }
 
     /// The cuboid with its four faces moved outward.
-    fn moved(&self, params: Params, [front, left, back, right]: [f64; 4]) -> Params {
+    pub(super) fn moved(&self, params: Params, [front, left, back, right]: [f64; 4]) -> Params {
         let (sin, cos) = params[YAW].sin_cos();
         let (along, across) = (0.5 * (front - back), 0.5 * (left - right));
         let mut moved = params;

@@ -3,15 +3,16 @@
 //! In: for each frame, a track's runs and the grey belt view, with the belt's travel. Out: an
 //! [`Estimate`] at any time, final when the parcel has left. Owns: the views of every pass.
 //! Limits: `limits.views_per_track_max`; a full pass is thinned to every second view.
-//! Cost: a few 10 us a frame and track; a refit every fourth view; in the frame of the exit
-//! two silhouettes from three starts each, then up to 17 starts of twelve Gauss-Newton steps on
-//! the edges of 20 views, and the best once on all views: some ms each, not spread over frames.
+//! Cost: a few 10 us a frame and track; a refit of the silhouettes every fourth view; over the last
+//! tenth of the zone a few jobs a frame of the search for the final fit's start; in the frame of
+//! the exit that start refined on all views.
 
 pub mod budget;
 mod corners;
 mod fit;
 mod model;
 mod observe;
+mod search;
 mod votes;
 
 pub use fit::Estimate;
@@ -26,8 +27,8 @@ use crate::plan::{Block, Memory, Plan};
 use crate::units::BeltRect;
 use corners::{CORNERS, Corner, top_motion};
 use fit::{Problem, Silhouette, canonical_estimate};
-use model::named_like;
 use observe::PassView;
+use search::{Found, Search};
 
 /// A first estimate needs this many views ...
 const FIRST_FIT_VIEWS: usize = 4;
@@ -35,6 +36,10 @@ const FIRST_FIT_VIEWS: usize = 4;
 const FIRST_FIT_TRAVEL_MM: f64 = 50.0;
 /// ... that together showed the parcel from this many of 32 directions.
 const DIRECTIONS_MIN: u32 = 24;
+/// The search for the final fit's start begins this share of the zone before the exit ...
+const SEARCH_SHARE: f64 = 0.12;
+/// ... and has ended a frame before it.
+const FRAMES_SPARE: f64 = 1.0;
 /// Refit after this many new views.
 const REFIT_VIEWS: usize = 4;
 /// Views that a pass over the zone gives, before thinning.
@@ -79,6 +84,23 @@ struct Pass {
     view_step_mm: f64,
     since_fit: usize,
     estimate: Option<Estimate>,
+    search: Search,
+}
+
+impl Pass {
+    fn begin(at: BeltPosition, view_step_mm: f64) -> Self {
+        Self {
+            view_count: 0,
+            directions: [0; 2],
+            reach_count: [0; 2],
+            first: at,
+            last: BeltPosition { travel_mm: f64::NEG_INFINITY, ..at },
+            view_step_mm,
+            since_fit: 0,
+            estimate: None,
+            search: Search::NEW,
+        }
+    }
 }
 
 /// The measuring stage: a pass for every track slot.
@@ -114,16 +136,6 @@ impl Measure {
         views_per_track: usize,
         memory: &mut Memory,
     ) -> Result<Self> {
-        let empty = Pass {
-            view_count: 0,
-            directions: [0; 2],
-            reach_count: [0; 2],
-            first: BeltPosition::default(),
-            last: BeltPosition::default(),
-            view_step_mm: 0.0,
-            since_fit: 0,
-            estimate: None,
-        };
         Ok(Self {
             geometry,
             zone,
@@ -131,7 +143,7 @@ impl Measure {
             rounding,
             views_per_track,
             views: memory.take("measure.views", PassView::EMPTY)?,
-            passes: memory.take("measure.passes", empty)?,
+            passes: memory.take("measure.passes", Pass::begin(BeltPosition::default(), 0.0))?,
             corners: memory.take("measure.corners", Corner::EMPTY)?,
         })
     }
@@ -139,16 +151,7 @@ impl Measure {
     /// Begin a pass.
     pub fn begin(&mut self, slot: usize, at: BeltPosition) {
         self.corners[slot * CORNERS..][..CORNERS].fill(Corner::EMPTY);
-        self.passes[slot] = Pass {
-            view_count: 0,
-            directions: [0; 2],
-            reach_count: [0; 2],
-            first: at,
-            last: BeltPosition { travel_mm: f64::NEG_INFINITY, ..at },
-            view_step_mm: self.zone.length_mm() / VIEWS_PER_ZONE,
-            since_fit: 0,
-            estimate: None,
-        };
+        self.passes[slot] = Pass::begin(at, self.zone.length_mm() / VIEWS_PER_ZONE);
     }
 
     /// What one frame shows of the parcel. `runs`: its blob, empty when it is not alone.
@@ -222,19 +225,45 @@ impl Measure {
             let [whole, bright] = pass.reach_count;
             let silhouette =
                 if 2 * whole >= bright { Silhouette::Whole } else { Silhouette::Bright };
-            let estimate = self.problem(slot, silhouette).fit_reach(self.views(slot), start);
+            let problem = self.problem(slot, silhouette, true).on_some_of(self.views(slot));
+            let estimate = problem.fit_reach(self.views(slot), start);
             let pass = &mut self.passes[slot];
             pass.estimate = estimate.or(pass.estimate);
             pass.since_fit = 0;
         }
     }
 
+    /// One frame nearer to the exit, the belt having moved by `step_mm`: so much of the search for
+    /// the final fit's start as is due.
+    pub fn search(&mut self, slot: usize, at: BeltPosition, step_mm: f64) {
+        let Some(outline) = self.outline(slot, at) else { return };
+        let left_mm = self.zone.x_max_mm - outline.trailing_x_mm();
+        if step_mm <= 0.0 || left_mm > SEARCH_SHARE * self.zone.length_mm() {
+            return;
+        }
+        let frames = (left_mm / step_mm - FRAMES_SPARE).max(1.0) as usize;
+        let jobs = self.passes[slot].search.jobs_left().div_ceil(frames);
+        self.search_jobs(slot, jobs);
+    }
+
+    fn search_jobs(&mut self, slot: usize, jobs: usize) {
+        let mut search = self.passes[slot].search;
+        let running = self.passes[slot].estimate.map(|e| e.params);
+        let problem = |silhouette, corners| self.problem(slot, silhouette, corners);
+        for _ in 0..jobs {
+            search.step(problem, self.views(slot), running, is_box);
+        }
+        self.passes[slot].search = search;
+    }
+
     fn views(&self, slot: usize) -> &[PassView] {
         &self.views[slot * self.views_per_track..][..self.passes[slot].view_count]
     }
 
-    fn problem(&self, slot: usize, silhouette: Silhouette) -> Problem<'_> {
+    fn problem(&self, slot: usize, silhouette: Silhouette, corners: bool) -> Problem<'_> {
         let pass = &self.passes[slot];
+        let top_motion =
+            top_motion(self.corners(slot), self.zone.length_mm(), self.geometry.mm_per_px);
         Problem {
             geometry: &self.geometry,
             zone: &self.zone,
@@ -244,11 +273,7 @@ impl Measure {
             travel_sigma: pass.last.sigma_since(&pass.first),
             silhouette,
             enclosing: false,
-            top_motion: top_motion(
-                self.corners(slot),
-                self.zone.length_mm(),
-                self.geometry.mm_per_px,
-            ),
+            top_motion: top_motion.filter(|_| corners),
             view_stride: 1,
         }
     }
@@ -265,18 +290,18 @@ impl Measure {
     }
 
     /// The final estimate, X at belt position `at`, length >= width.
-    pub fn finish(&self, slot: usize, at: BeltPosition) -> Option<Measured> {
+    pub fn finish(&mut self, slot: usize, at: BeltPosition) -> Option<Measured> {
+        // Nothing is left of a pass that ends as expected.
+        while self.passes[slot].search.jobs_left() > 0 {
+            self.search_jobs(slot, 1);
+        }
         let (cuboid, disputed) = self.cuboid(slot);
         let mut result = match cuboid {
             Some(cuboid) if is_box(&cuboid) => {
                 Measured { estimate: cuboid, is_box: true, has_edges: true, disputed }
             }
             other => {
-                #[expect(
-                    clippy::redundant_closure_for_method_calls,
-                    reason = "the method itself is not general over the problem's lifetime"
-                )]
-                let enclosing = self.best(slot, |problem, views| problem.fit_enclosing(views));
+                let enclosing = self.enclosing(slot);
                 let estimate = enclosing.or(other).or(self.passes[slot].estimate)?;
                 let has_edges = other.is_some_and(|e| e.edge_count > 0);
                 Measured { estimate, is_box: false, has_edges, disputed: false }
@@ -292,28 +317,28 @@ impl Measure {
     /// The cuboid that edges and corners show, and whether they dispute its height. Corners that
     /// lead away from the edges are not on the top face.
     fn cuboid(&self, slot: usize) -> (Option<Estimate>, bool) {
-        let fit = |with_corners: bool| {
-            self.best(slot, |problem, views| {
-                let top_motion = problem.top_motion.filter(|_| with_corners);
-                let problem = Problem { top_motion, ..*problem };
-                let reach = problem.fit_reach(views, None)?;
-                // Profiles were taken across the faces of the running estimate.
-                let running = self.passes[slot].estimate.map_or(reach.params, |e| e.params);
-                let edges = problem.fit_edges(views, named_like(reach.params, &running));
-                edges.filter(|e| e.edge_count >= EDGE_COUNT_MIN).or(Some(reach))
-            })
+        let views = self.views(slot);
+        let refine = |found: Found, corners: bool| {
+            let problem = self.problem(slot, found.silhouette, corners);
+            let start = found.estimate.params;
+            let edges = problem.fit_edges(views, start);
+            edges
+                .filter(|e| e.edge_count >= EDGE_COUNT_MIN)
+                .or_else(|| problem.fit_reach(views, Some(start)))
         };
-        let whole = self.problem(slot, Silhouette::Whole);
-        if whole.top_motion.is_none() {
-            return (fit(false), false);
-        }
-        let Some(both) = fit(true) else { return (fit(false), false) };
+        let search = &self.passes[slot].search;
+        let Some(found) = search.with_corners() else { return (None, false) };
+        let both = refine(found, true);
+        let problem = self.problem(slot, found.silhouette, true);
+        let (Some(both), Some(_)) = (both, problem.top_motion) else { return (both, false) };
         if is_box(&both) {
-            let edges = whole.without_corners(self.views(slot), &both);
+            let edges = self.problem(slot, found.silhouette, false).on_some_of(views);
+            let edges = edges.fit_edges(views, both.params);
             return (Some(both), edges.is_some_and(|e| e.disputes_height(&both)));
         }
         // Texture above a box's top there is not: it is no box then.
-        let edges = fit(false).filter(|edges| {
+        let edges = search.without_corners().and_then(|found| refine(found, false));
+        let edges = edges.filter(|edges| {
             edges.edge_count > 0
                 && both.params[HEIGHT] < edges.params[HEIGHT]
                 && both.score() < LED_AWAY_SCORE * edges.score()
@@ -321,16 +346,11 @@ impl Measure {
         (edges.or(Some(both)), edges.is_some_and(|e| e.disputes_height(&both)))
     }
 
-    /// The better fit of the whole blob and of its bright part.
-    fn best(
-        &self,
-        slot: usize,
-        fit: impl Fn(&Problem<'_>, &[PassView]) -> Option<Estimate>,
-    ) -> Option<Estimate> {
-        let [whole, bright] = [Silhouette::Whole, Silhouette::Bright]
-            .map(|silhouette| fit(&self.problem(slot, silhouette), self.views(slot)));
-        let score = |e: &Option<Estimate>| e.map_or(f64::NEG_INFINITY, |e| e.score());
-        if score(&bright) > score(&whole) { bright } else { whole }
+    /// The smallest cuboid that holds the whole blob, or its bright part, whichever fits better.
+    fn enclosing(&self, slot: usize) -> Option<Estimate> {
+        let fits = [Silhouette::Whole, Silhouette::Bright]
+            .map(|silhouette| self.problem(slot, silhouette, true).fit_enclosing(self.views(slot)));
+        fits.into_iter().flatten().max_by(|a, b| a.score().total_cmp(&b.score()))
     }
 }
 
@@ -391,8 +411,12 @@ mod tests {
     fn fit(views: &[PassView], travel_sigma: f64) -> Option<Estimate> {
         let geometry = geometry();
         let problem = problem(&geometry, travel_sigma);
-        let reach = problem.fit_reach(views, None)?;
-        problem.fit_edges(views, reach.params).map(canonical_estimate)
+        let mut search = Search::NEW;
+        while search.jobs_left() > 0 {
+            search.step(|silhouette, _| Problem { silhouette, ..problem }, views, None, is_box);
+        }
+        let start = search.with_corners()?.estimate.params;
+        problem.fit_edges(views, start).map(canonical_estimate)
     }
 
     fn assert_near(estimate: &Estimate, truth: &Params, tolerance_mm: f64) {

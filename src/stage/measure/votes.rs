@@ -24,6 +24,7 @@ pub(super) const RISING_TRUST: f64 = 0.5;
 pub(super) const SLOPE_ENOUGH: f32 = 3.0;
 
 /// What the profiles say about a face.
+#[derive(Clone, Copy, Debug)]
 pub struct FaceVote {
     /// Outward from the silhouette's face to the edge agreed upon, mm.
     pub offset_mm: f64,
