@@ -221,6 +221,13 @@ pub fn update(x: u16, pixel: &mut Pixel, learn: bool, params: &Params) -> Class 
 }
 
 impl Minor {
+    /// A mode that has seen one observation.
+    pub fn new(x: u16, rate: &Rate) -> Self {
+        let (mantissa, shift, dither) = rate.for_weight();
+        let weight = ((255 * mantissa + dither) >> shift) as u8;
+        Self { mean: x, variance: (VARIANCE_NEW >> VARIANCE_GAINED) as u8, weight }
+    }
+
     fn variance_q10(self) -> u16 {
         u16::from(self.variance) << VARIANCE_GAINED
     }
@@ -308,14 +315,12 @@ impl Pixel {
     /// A new mode takes the place of the weakest. At a rate below 1/255 it has a weight in some
     /// frames only.
     fn insert(&mut self, x: u16, rate: &Rate) {
-        let (mantissa, shift, dither) = rate.for_weight();
-        let weight = ((255 * mantissa + dither) >> shift) as u8;
-        if weight == 0 {
+        let new = Minor::new(x, rate);
+        if new.weight == 0 {
             return;
         }
         let free = self.minors.iter().position(|m| m.weight == 0).unwrap_or(MINORS - 1);
-        let variance = (VARIANCE_NEW >> VARIANCE_GAINED) as u8;
-        self.minors[free] = Minor { mean: x, variance, weight };
+        self.minors[free] = new;
     }
 
     /// Keep modes in order of weight.

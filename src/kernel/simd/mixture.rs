@@ -11,6 +11,9 @@ use crate::kernel::scalar::mixture::{
 };
 use fearless_simd::{Level, dispatch, prelude::*};
 
+/// A new mode of this weight would be the main one.
+const OUTWEIGHS: u8 = 128;
+
 /// Pixels of a block: the bits of a mask's word.
 pub const BLOCK: usize = 64;
 
@@ -90,6 +93,7 @@ fn update_blocks<S: Simd>(
     masks: &mut Masks<'_>,
     params: &Params,
 ) {
+    let new_weight = Minor::new(0, &params.rate).weight;
     let (greys, _) = grey.as_chunks::<BLOCK>();
     let (means, _) = model.mean.as_chunks_mut::<BLOCK>();
     let (variances, _) = model.variance.as_chunks_mut::<BLOCK>();
@@ -123,10 +127,16 @@ fn update_blocks<S: Simd>(
         }
         // A weaker mode learns, or a new one begins.
         let alone = !(near | hold | shade.shadow);
-        if alone != 0 {
+        let begins = if new_weight < OUTWEIGHS { alone & !*multiple } else { 0 };
+        if begins != 0 && new_weight > 0 {
+            begin_one_by_one(begins, grey, &mut model.minors[0], w * BLOCK, params);
+            *multiple |= begins;
+        }
+        let learns = alone & !begins;
+        if learns != 0 {
             let (main, minors) = ([mean, variance], &mut model.minors);
-            let more = learn_one_by_one(alone, grey, main, minors, w * BLOCK, params);
-            *multiple = (*multiple & !alone) | more;
+            let more = learn_one_by_one(learns, grey, main, minors, w * BLOCK, params);
+            *multiple = (*multiple & !learns) | more;
         }
         let foreground = if within == u64::MAX { 0 } else { shade.foreground() };
         masks.foreground[w] = foreground;
@@ -178,6 +188,27 @@ fn fade<S: Simd>(simd: S, weights: &mut [u8], fading: u64, params: &Params) -> u
     lasting
 }
 
+/// Pixels of a mask.
+fn each(mut mask: u64, mut visit: impl FnMut(usize)) {
+    while mask != 0 {
+        visit(mask.trailing_zeros() as usize);
+        mask &= mask - 1;
+    }
+}
+
+/// A second mode begins at each pixel of `begins`, a block that begins at pixel `from`.
+fn begin_one_by_one(
+    begins: u64,
+    grey: &[u8; BLOCK],
+    minors: &mut Minors<'_>,
+    from: usize,
+    params: &Params,
+) {
+    each(begins, |i| {
+        minors.set(from + i, Minor::new(observation(grey[i], params.gain), &params.rate));
+    });
+}
+
 /// The specification's learning for the pixels of `alone`, a block that begins at pixel `from`;
 /// returns which of them have a second mode.
 fn learn_one_by_one(
@@ -189,10 +220,7 @@ fn learn_one_by_one(
     params: &Params,
 ) -> u64 {
     let mut multiple = 0;
-    let mut left = alone;
-    while left != 0 {
-        let i = left.trailing_zeros() as usize;
-        left &= left - 1;
+    each(alone, |i| {
         let minors = [first.get(from + i), second.get(from + i)];
         let mut pixel = Pixel { mean: mean[i], variance: variance[i], minors };
         pixel.learn(observation(grey[i], params.gain), params);
@@ -200,7 +228,7 @@ fn learn_one_by_one(
         first.set(from + i, pixel.minors[0]);
         second.set(from + i, pixel.minors[1]);
         multiple |= u64::from(pixel.is_multiple()) << i;
-    }
+    });
     multiple
 }
 
