@@ -279,7 +279,7 @@ fn the_belt_is_its_own_odometer() {
 #[test]
 fn a_belt_without_texture_says_that_its_speed_is_assumed() {
     let mut scenario =
-        scenario(150, 500.0, &parcel([235.0, 125.0, 70.0], 12.0, [-900.0, -100.0], "kraft"));
+        scenario(165, 500.0, &parcel([235.0, 125.0, 70.0], 12.0, [-1150.0, -100.0], "kraft"));
     scenario.belt.texture_grey = 0.0;
     let pairs = matched(&scenario, &measure(&scenario, 500.0));
     assert!(pairs[0].1.flags.has(Flags::SPEED_ASSUMED), "{:?}", pairs[0].1);

@@ -162,11 +162,11 @@ impl Default for Limits {
     fn default() -> Self {
         Self {
             memory_mib_max: 256,
-            tracks_max: 24,
+            tracks_max: 16,
             runs_max: 16384,
             blobs_max: 512,
             views_per_track_max: 96,
-            frames_queued_max: 4,
+            frames_queued_max: 3,
         }
     }
 }

@@ -39,8 +39,10 @@ const SPLIT_TRAVEL_PX: f64 = 20.0;
 const SPLIT_SHARE: f32 = 0.1;
 /// ... that are bright by this share: other blobs may be shadows.
 const SPLIT_BRIGHT_SHARE: f32 = 0.5;
-/// A track that was measured while it was apart is no mere piece of what it now runs together with,
-/// if its box is at least this share of it.
+/// A track that was measured while it was apart over this travel, px, is no mere piece of what it
+/// now runs together with, ...
+const APART_TRAVEL_PX: f32 = 80.0;
+/// ... if its box is at least this share of it.
 const APART_SHARE: f32 = 0.2;
 /// Inside means this share of its box.
 const INSIDE_SHARE: f32 = 0.8;
@@ -249,8 +251,9 @@ impl Tracker {
         let Some(blob) = hidden_by else { return };
         let owner = usize::from(self.owners[blob.label as usize]);
         let whole = self.tracks[owner].bounds.union(&blob.bounds);
-        let was_apart =
-            covers(slot, &bounds).is_some() && bounds.area() >= APART_SHARE * whole.area();
+        let was_apart = covers(slot, &bounds).is_some()
+            && bounds.area() >= APART_SHARE * whole.area()
+            && self.tracks[slot].followed_px() >= APART_TRAVEL_PX;
         let inside = covers(owner, &bounds) == Some(true)
             || !was_apart && whole.overlap(&bounds) >= INSIDE_SHARE * bounds.area();
         let track = &mut self.tracks[slot];
@@ -307,8 +310,10 @@ impl Tracker {
         let is_parcel = |b: &&Blob| {
             bright(b) > SPLIT_SHARE * total && bright(b) >= SPLIT_BRIGHT_SHARE * b.area_px as f32
         };
-        let mut parcels = blobs.iter().filter(|b| owned(&self.owners, b)).filter(is_parcel);
-        let (Some(first), Some(_)) = (parcels.next(), parcels.next()) else {
+        let parcels = || blobs.iter().filter(|b| owned(&self.owners, b)).filter(is_parcel);
+        // The largest goes on; the others must show that they ride on the belt: one may be a ghost.
+        let largest = parcels().max_by_key(|b| b.bright_px);
+        let Some(first) = largest.filter(|_| parcels().nth(1).is_some()) else {
             track.split_px = 0.0;
             return;
         };

@@ -443,7 +443,8 @@ impl Problem<'_> {
                 let facing = outline.side_visible[sample.edge.face()];
                 let known = polarity[e][usize::from(facing)];
                 let rising = if facing && !sample.edge.is_base() { RISING_TRUST } else { 1.0 };
-                let chosen = choose(sample, at, gate_mm, known, rising);
+                let steps = sample.steps(self.geometry.mm_per_px);
+                let chosen = choose(steps, at, gate_mm, known, rising);
                 let Some((residual, slope)) = chosen else { continue };
                 used.used += 1;
                 used.squares += residual * residual;

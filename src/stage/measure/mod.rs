@@ -427,7 +427,7 @@ mod tests {
         }
     }
 
-    /// Deterministic noise with a standard deviation of about 0.5.
+    /// Deterministic noise with a standard deviation of about 0.5 px.
     fn noise(i: usize) -> f32 {
         let bits = (i as u32).wrapping_mul(2_654_435_761) >> 8;
         (bits as f32 / (1 << 24) as f32 - 0.5) * 1.7

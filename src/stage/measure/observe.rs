@@ -20,6 +20,22 @@ const PROFILE_HALF_WIDTH: i32 = 1;
 /// Weaker steps than this, grey levels a px, drown in sensor noise.
 const SLOPE_MIN: f32 = 0.8;
 
+/// A step as it is kept: half the bytes, and finer than it can be found.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub struct KeptStep {
+    /// Offset from the anchor along `outward`, px, Q10.
+    at_q10: i16,
+    /// Grey levels a px, Q6.
+    slope_q6: i16,
+}
+
+impl KeptStep {
+    /// A step at `at_px` from the anchor.
+    pub fn new(at_px: f32, slope: f32) -> Self {
+        Self { at_q10: (at_px * 1024.0).round() as i16, slope_q6: (slope * 64.0).round() as i16 }
+    }
+}
+
 /// A profile across a predicted edge.
 #[derive(Clone, Copy, Debug)]
 pub struct EdgeSample {
@@ -29,8 +45,8 @@ pub struct EdgeSample {
     pub anchor: [f32; 2],
     /// Outward direction of the profile.
     pub outward: [f32; 2],
-    /// Steps found: offset from the anchor along `outward`, mm; and slope. Unused: slope 0.
-    pub steps: [Step; STEPS],
+    /// Steps found. Unused: slope 0.
+    steps: [KeptStep; STEPS],
 }
 
 impl EdgeSample {
@@ -39,8 +55,27 @@ impl EdgeSample {
         edge: EdgeId(0),
         anchor: [0.0; 2],
         outward: [0.0; 2],
-        steps: [Step { at: 0.0, slope: 0.0 }; STEPS],
+        steps: [KeptStep { at_q10: 0, slope_q6: 0 }; STEPS],
     };
+}
+
+impl EdgeSample {
+    /// The steps found: offset from the anchor along `outward`, mm, and slope, grey levels a px.
+    pub fn steps(&self, mm_per_px: f64) -> impl Iterator<Item = (f64, f32)> + '_ {
+        let found = self.steps.iter().filter(|step| step.slope_q6 != 0);
+        found.map(move |step| {
+            let at_px = f64::from(step.at_q10) / 1024.0;
+            (at_px * mm_per_px, f32::from(step.slope_q6) / 64.0)
+        })
+    }
+
+    /// A profile with these steps.
+    #[cfg(test)]
+    pub fn with_steps(steps: [KeptStep; 2]) -> Self {
+        let mut sample = Self::EMPTY;
+        sample.steps[..2].copy_from_slice(&steps);
+        sample
+    }
 }
 
 /// One frame's share of a pass.
@@ -210,23 +245,24 @@ impl Frame<'_> {
             [px.u as f32 - SEARCH_PX as f32 * step[0], px.v as f32 - SEARCH_PX as f32 * step[1]];
         let mut profile = [0.0; 2 * SEARCH_PX + 1];
         sample(self.grey, start, step, PROFILE_HALF_WIDTH, &mut profile)?;
-        let mut found = EdgeSample::EMPTY.steps;
+        let mut found = [Step::default(); STEPS];
         // A profile without a step counts: it shows that no edge is here.
-        steps(&profile, SLOPE_MIN, &mut found);
-        for step in found.iter_mut().filter(|s| s.slope != 0.0) {
-            step.at = (step.at - SEARCH_PX as f32) * self.view.mm_per_px as f32;
+        let count = steps(&profile, SLOPE_MIN, &mut found);
+        let mut kept = EdgeSample::EMPTY.steps;
+        for (kept, step) in kept.iter_mut().zip(&found[..count]) {
+            *kept = KeptStep::new(step.at - SEARCH_PX as f32, step.slope);
         }
         Some(EdgeSample {
             edge,
             anchor: [anchor.x as f32, anchor.y as f32],
             outward: [outward.x as f32, outward.y as f32],
-            steps: found,
+            steps: kept,
         })
     }
 }
 
 impl PassView {
-    /// What a perfect camera sees of a cuboid; `distort` moves each step, mm, by sample index.
+    /// What a perfect camera sees of a cuboid; `distort` moves each step, px, by sample index.
     pub(super) fn of(
         outline: &Outline,
         travel_mm: f64,
@@ -249,7 +285,7 @@ impl PassView {
                     outward: [outward.x as f32, outward.y as f32],
                     ..EdgeSample::EMPTY
                 };
-                sample.steps[0] = Step { at: distort(count), slope: -20.0 };
+                sample.steps[0] = KeptStep::new(distort(count), -20.0);
                 view.samples[count] = sample;
                 count += 1;
             }

@@ -3,7 +3,7 @@
 
 use super::fit::{Problem, SIDE_DEPTH_MIN_PX};
 use super::model::{HEIGHT, LENGTH, Params, WIDTH};
-use super::observe::{EdgeSample, PassView};
+use super::observe::PassView;
 
 /// Votes on where a face's top edge is, relative to the silhouette's: bins of half a pixel,
 /// from well inside (shadows and dark sides widen a silhouette) to a little outside.
@@ -49,14 +49,14 @@ impl Problem<'_> {
             }
             for sample in view.samples().iter().filter(|s| !s.edge.is_base()) {
                 let Some((at, _)) = self.predict(&outline, sample) else { continue };
-                for step in sample.steps.iter().filter(|s| s.slope != 0.0) {
-                    let offset_px = (f64::from(step.at) - at) / self.geometry.mm_per_px;
+                for (step_mm, slope) in sample.steps(self.geometry.mm_per_px) {
+                    let offset_px = (step_mm - at) / self.geometry.mm_per_px;
                     let bin = ((offset_px - VOTE_FIRST_PX) / VOTE_BIN_PX).floor();
                     if (0.0..VOTE_BINS as f64).contains(&bin) {
                         let face = sample.edge.face();
                         let facing = outline.side_visible[face];
                         votes[face][usize::from(facing)][bin as usize] +=
-                            f64::from(step.slope.clamp(-VOTE_SLOPE_MAX, VOTE_SLOPE_MAX));
+                            f64::from(slope.clamp(-VOTE_SLOPE_MAX, VOTE_SLOPE_MAX));
                     }
                 }
             }
@@ -101,23 +101,23 @@ fn outermost_peak(votes: &[[f64; VOTE_BINS]; 2], first_px: f64) -> Option<f64> {
 /// The step that belongs to the predicted edge: inside the gate, of the edge's polarity once
 /// that is known, the strongest for its distance. Returns residual and slope.
 pub(super) fn choose(
-    sample: &EdgeSample,
+    steps: impl Iterator<Item = (f64, f32)>,
     predicted_mm: f64,
     gate_mm: f64,
     polarity: f64,
     rising: f64,
 ) -> Option<(f64, f32)> {
     let mut best: Option<(f64, f64, f32)> = None;
-    for step in sample.steps.iter().filter(|s| s.slope != 0.0) {
-        let residual = f64::from(step.at) - predicted_mm;
+    for (step_mm, slope) in steps {
+        let residual = step_mm - predicted_mm;
         let near = 1.0 - (residual / gate_mm).powi(2);
-        if near <= 0.0 || f64::from(step.slope) * polarity < 0.0 {
+        if near <= 0.0 || f64::from(slope) * polarity < 0.0 {
             continue;
         }
-        let sign = if step.slope > 0.0 { rising } else { 1.0 };
-        let score = f64::from(step.slope.abs().min(SLOPE_ENOUGH)) * near * sign;
+        let sign = if slope > 0.0 { rising } else { 1.0 };
+        let score = f64::from(slope.abs().min(SLOPE_ENOUGH)) * near * sign;
         if best.is_none_or(|(s, _, _)| score > s) {
-            best = Some((score, residual, step.slope));
+            best = Some((score, residual, slope));
         }
     }
     best.map(|(_, residual, slope)| (residual, slope))
@@ -125,8 +125,8 @@ pub(super) fn choose(
 
 #[cfg(test)]
 mod tests {
+    use super::super::observe::{EdgeSample, KeptStep};
     use super::*;
-    use crate::kernel::scalar::profile::Step;
 
     fn votes(places: &[(f64, f64)]) -> [f64; VOTE_BINS] {
         let mut votes = [0.0; VOTE_BINS];
@@ -155,25 +155,21 @@ mod tests {
     }
 
     fn sample(steps: [(f32, f32); 2]) -> EdgeSample {
-        let mut sample = EdgeSample::EMPTY;
-        for (kept, (at, slope)) in sample.steps.iter_mut().zip(steps) {
-            *kept = Step { at, slope };
-        }
-        sample
+        EdgeSample::with_steps(steps.map(|(at, slope)| KeptStep::new(at, slope)))
     }
 
     #[test]
     fn a_label_further_away_does_not_outdo_a_dark_edge() {
-        let chosen = choose(&sample([(0.5, -4.0), (-4.0, -60.0)]), 0.0, 6.0, 0.0, 1.0);
+        let chosen = choose(sample([(0.5, -4.0), (-4.0, -60.0)]).steps(1.0), 0.0, 6.0, 0.0, 1.0);
         assert_eq!(chosen, Some((0.5, -4.0)));
     }
 
     #[test]
     fn above_a_visible_side_the_falling_edge_is_the_top_one() {
         let steps = sample([(1.0, 3.0), (-1.0, -3.0)]);
-        let chosen = choose(&steps, 0.2, 6.0, 0.0, RISING_TRUST);
+        let chosen = choose(steps.steps(1.0), 0.2, 6.0, 0.0, RISING_TRUST);
         assert_eq!(chosen.map(|c| c.1), Some(-3.0));
         // Where rising edges are as likely, the nearer one is taken.
-        assert_eq!(choose(&steps, 0.2, 6.0, 0.0, 1.0).map(|c| c.1), Some(3.0));
+        assert_eq!(choose(steps.steps(1.0), 0.2, 6.0, 0.0, 1.0).map(|c| c.1), Some(3.0));
     }
 }
