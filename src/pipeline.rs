@@ -10,7 +10,7 @@ use crate::error::{Error, Result};
 use crate::event::{Counters, Flags, ParcelRecord, Shape};
 use crate::image::{FrameTime, Plane};
 use crate::kernel::Level;
-use crate::kernel::scalar::bits::{self, dilate, words};
+use crate::kernel::scalar::bits::{self, Square, words};
 use crate::plan::{Block, Memory, Plan};
 use crate::stage::background::Background;
 use crate::stage::measure::{self, Frame, Measure, Measured};
@@ -90,18 +90,21 @@ impl Pipeline {
         let start = FrameTime { index: 0, t_s: 0.0 };
         let nowhere =
             Reference { began_s: 0.0, time: start, at: BeltPosition::default(), fixed: false };
-        let level = Level::new();
-        let rectify = Rectify::new(&site.camera, view, level, memory)?;
-        let background = Background::new(view.size_px, config.background.clone(), level, memory)?;
+        let (level, bands) = (Level::new(), config.realtime.workers);
+        let rectify = Rectify::new(&site.camera, view, level, bands, memory)?;
+        let background =
+            Background::new(view.size_px, config.background.clone(), level, bands, memory)?;
         let odometry = Odometry::new(
             view,
             &zone,
             config.belt.speed_mm_per_s,
             config.odometry.speed_error_max,
             level,
+            bands,
             memory,
         )?;
-        let segment = Segment::new(view.size_px, view.mm_per_px, config.segment.clone(), memory)?;
+        let segment =
+            Segment::new(view.size_px, view.mm_per_px, config.segment.clone(), bands, memory)?;
         let tracker = Tracker::new(view.mm_per_px, magnification_max, memory)?;
         let measure = Measure::new(
             view.clone(),
@@ -190,17 +193,21 @@ impl Pipeline {
                 bits::set(&mut self.hold[usize::from(run.v) * n..][..n], run.start, run.end);
             }
         }
-        dilate(&mut self.hold, &mut self.scratch, width, HOLD_MARGIN_PX);
+        self.square(HOLD_MARGIN_PX).dilate(&mut self.hold, &mut self.scratch);
         for (hold, seen) in self.hold.iter_mut().zip(self.rectify.seen()) {
             *hold |= !seen;
         }
     }
 
+    fn square(&self, radius: usize) -> Square {
+        let (width, bands) = (self.site.view.size_px[0], self.site.config.realtime.workers);
+        Square { width, radius, bands }
+    }
+
     /// What is not free belt: every blob with its surroundings.
     fn cover(&mut self) {
         self.covered.copy_from_slice(self.segment.mask());
-        let width = self.site.view.size_px[0];
-        dilate(&mut self.covered, &mut self.scratch, width, COVER_MARGIN_PX);
+        self.square(COVER_MARGIN_PX).dilate(&mut self.covered, &mut self.scratch);
         for (covered, seen) in self.covered.iter_mut().zip(self.rectify.seen()) {
             *covered |= !seen;
         }

@@ -31,7 +31,7 @@ fn count() {
     unsafe { prctl(PR_GET_NAME, name.as_mut_ptr()) };
     if name.starts_with(b"capture\0") {
         CAPTURE.fetch_add(1, Ordering::Relaxed);
-    } else if name.starts_with(b"vision\0") {
+    } else if name.starts_with(b"vision") {
         VISION.fetch_add(1, Ordering::Relaxed);
     }
 }
@@ -83,11 +83,12 @@ impl FrameSource for Watched {
 }
 
 /// Run the appliance over 510 frames; returns parcels and allocations on both threads.
-fn run(leak: bool) -> (u64, u64, u64) {
+fn run(leak: bool, workers: usize) -> (u64, u64, u64) {
     CAPTURE.store(0, Ordering::Relaxed);
     VISION.store(0, Ordering::Relaxed);
     let scenario = demo::scenario().expect("valid");
     let mut site = demo::site(&scenario).expect("valid");
+    site.config.realtime.workers = workers;
     site.config.modbus.listen = ([127, 0, 0, 1], 0).into();
     let belt = Synthetic::new(scenario).expect("renders");
     let mut source = Watched { belt, frames: 0, leak };
@@ -103,10 +104,14 @@ fn run(leak: bool) -> (u64, u64, u64) {
 
 #[test]
 fn five_hundred_frames_with_parcels_allocate_nothing() {
-    let (parcels, capture, vision) = run(false);
+    let (parcels, capture, vision) = run(false, 1);
     assert!(parcels >= 5, "only {parcels} parcels passed: the test proves nothing");
     assert_eq!((capture, vision), (0, 0), "allocations on the capture and vision threads");
+    // Two workers: the threads are called "vision 0" and "vision 1".
+    let (more_parcels, capture, vision) = run(false, 2);
+    assert!(more_parcels >= 5, "only {more_parcels} parcels passed with two workers");
+    assert_eq!((capture, vision), (0, 0), "allocations with two workers");
     // The counter counts: one allocation and one release a frame while armed.
-    let (_, capture, _) = run(true);
+    let (_, capture, _) = run(true, 1);
     assert!(capture >= 500, "the counter saw only {capture} planted allocations");
 }

@@ -297,6 +297,18 @@ fn the_same_frames_give_the_same_records() {
 }
 
 #[test]
+fn any_number_of_workers_gives_the_same_records() {
+    let scenario = scenario(110, 500.0, &four_boxes());
+    let one = measure(&scenario, 490.0);
+    assert!(!one.is_empty());
+    for workers in [2, 3, 8] {
+        let mut site = site(&scenario, 490.0);
+        site.config.realtime.workers = workers;
+        assert_eq!(measure_scenario(&scenario, site), one, "{workers} workers");
+    }
+}
+
+#[test]
 fn a_truncated_recording_keeps_what_was_measured_before() {
     let scenario = scenario(170, 500.0, &four_boxes());
     let folder = common::scratch("truncated_recording");

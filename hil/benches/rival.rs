@@ -7,7 +7,7 @@
 
 use beltgauge::image::{FrameTime, Plane};
 use beltgauge::kernel::Level;
-use beltgauge::kernel::scalar::bits::{dilate, stride};
+use beltgauge::kernel::scalar::bits::{Square, stride};
 use beltgauge::plan::Plan;
 use beltgauge::stage::background::Background;
 use beltgauge::stage::rectify::Rectify;
@@ -71,18 +71,20 @@ fn stages(scene: &Scene) -> Vec<Pair> {
     Background::plan(size, &mut plan);
     Segment::plan(size, &site.config.limits, &mut plan);
     let mut memory = plan.reserve(256).expect("fits");
-    let mut rectify = Rectify::new(&site.camera, &site.view, level, &mut memory).expect("planned");
+    let mut rectify =
+        Rectify::new(&site.camera, &site.view, level, 1, &mut memory).expect("planned");
     let background = site.config.background.clone();
-    let mut background = Background::new(size, background, level, &mut memory).expect("planned");
+    let mut background = Background::new(size, background, level, 1, &mut memory).expect("planned");
     let segment = site.config.segment.clone();
     let mut segment =
-        Segment::new(size, site.view.mm_per_px, segment, &mut memory).expect("planned");
+        Segment::new(size, site.view.mm_per_px, segment, 1, &mut memory).expect("planned");
     let mut theirs = Chain::new(site);
     let mut pairs = ["rectification", "background", "morphology and labels", "copy of that memory"]
         .map(Pair::new);
     // What a parcel covers is not learned, as in the pipeline.
     let mut hold: Vec<u64> = rectify.seen().iter().map(|seen| !seen).collect();
     let mut scratch = hold.clone();
+    let square = Square { width: size[0], radius: 2, bands: 1 };
     let model = vec![7u8; stride(size[0]) * size[1] * 5];
     let mut copy = vec![0u8; model.len()];
     let [width, height] = site.camera.image_size_px;
@@ -98,7 +100,7 @@ fn stages(scene: &Scene) -> Vec<Pair> {
         timed(&mut label.ours, || segment.step(foreground, strong, dark));
         timed(&mut label.theirs, || theirs.label());
         hold.copy_from_slice(segment.mask());
-        dilate(&mut hold, &mut scratch, size[0], 2);
+        square.dilate(&mut hold, &mut scratch);
         for (hold, seen) in hold.iter_mut().zip(rectify.seen()) {
             *hold |= !seen;
         }

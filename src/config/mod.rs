@@ -3,7 +3,7 @@
 
 mod schema;
 
-pub use schema::{Background, Config, Limits, Measure, Modbus, Odometry, Segment, View};
+pub use schema::{Background, Config, Limits, Measure, Modbus, Odometry, Realtime, Segment, View};
 
 use crate::camera::{BeltView, Camera, CameraFile};
 use crate::error::{Error, Result};

@@ -34,6 +34,9 @@ pub struct Config {
     /// `[limits]`
     #[serde(default)]
     pub limits: Limits,
+    /// `[realtime]`
+    #[serde(default)]
+    pub realtime: Realtime,
     /// `[modbus]`
     #[serde(default)]
     pub modbus: Modbus,
@@ -171,6 +174,26 @@ impl Default for Limits {
     }
 }
 
+/// `[realtime]`: how the vision thread gets its processor.
+#[derive(Clone, Debug, PartialEq, Deserialize)]
+#[serde(deny_unknown_fields, default)]
+pub struct Realtime {
+    /// Threads that a frame's rows are shared among.
+    pub workers: usize,
+    /// Lock all memory, so that none is ever swapped out.
+    pub lock_memory: bool,
+    /// `SCHED_FIFO` priority of the vision threads; 0: an ordinary thread.
+    pub priority: u8,
+    /// Bind the vision threads to this processor and those after it.
+    pub first_processor: Option<usize>,
+}
+
+impl Default for Realtime {
+    fn default() -> Self {
+        Self { workers: 1, lock_memory: false, priority: 0, first_processor: None }
+    }
+}
+
 /// `[modbus]`: the server for the PLC.
 #[derive(Clone, Debug, PartialEq, Deserialize)]
 #[serde(deny_unknown_fields, default)]
@@ -216,6 +239,7 @@ impl Config {
             odometry,
             measure,
             limits,
+            realtime,
             modbus,
         } = self;
         for (key, mm) in [
@@ -264,6 +288,11 @@ impl Config {
         count("limits.blobs_max", limits.blobs_max, 16, 1 << 16)?;
         count("limits.views_per_track_max", limits.views_per_track_max, 16, 1024)?;
         count("limits.frames_queued_max", limits.frames_queued_max, 2, 15)?;
+        count("realtime.workers", realtime.workers, 1, 8)?;
+        count("realtime.priority", usize::from(realtime.priority), 0, 99)?;
+        if let Some(processor) = realtime.first_processor {
+            count("realtime.first_processor", processor, 0, 1023)?;
+        }
         count("modbus.connections_max", modbus.connections_max, 1, 256)?;
         count("modbus.idle_timeout_s", modbus.idle_timeout_s as usize, 1, 86_400)
     }

@@ -3,6 +3,7 @@
 //! [`scalar`] is the specification, [`simd`] the same for every pixel of every frame in vectors:
 //! integer kernels give the same bits at every instruction level.
 
+pub mod bands;
 pub mod scalar;
 pub mod simd;
 

@@ -7,7 +7,8 @@
 //! A frame buffer is always in exactly one place. When no buffer is free the frame is dropped
 //! and counted; when a record ring is full the record is counted; vision never waits.
 
-use crate::config::Site;
+use super::realtime;
+use crate::config::{Realtime, Site};
 use crate::error::{Error, Result};
 use crate::event::ParcelRecord;
 use crate::image::{FrameTime, Plane};
@@ -17,8 +18,8 @@ use crate::plc::modbus;
 use crate::plc::registers::Status;
 use crate::source::FrameSource;
 use heapless::spsc::{Consumer, Producer, Queue};
-use std::sync::Mutex;
 use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
+use std::sync::{Mutex, OnceLock};
 use std::time::{Duration, Instant};
 
 /// Frame buffers that a ring holds: the largest `limits.frames_queued_max`, and one.
@@ -67,11 +68,19 @@ struct Shared {
     stop: AtomicBool,
     source_ended: AtomicBool,
     vision_ended: AtomicBool,
+    /// The thread that takes the frames, once it runs.
+    vision: OnceLock<std::thread::Thread>,
     frames_dropped: AtomicU64,
     progress: Mutex<Progress>,
 }
 
 impl Shared {
+    fn wake_vision(&self) {
+        if let Some(vision) = self.vision.get() {
+            vision.unpark();
+        }
+    }
+
     fn stopped(&self) -> bool {
         self.stop.load(Ordering::Relaxed)
     }
@@ -101,7 +110,9 @@ impl Appliance {
         self.site.check_image_size(source.size_px())?;
         let modbus_settings = self.site.config.modbus.clone();
         let (pace, listener) = (self.pace, self.listener);
+        let realtime = self.site.config.realtime.clone();
         let (buffers, pipeline) = super::memory::build(self.site)?;
+        realtime::lock_memory(&realtime)?;
         let shared = Shared::default();
         let (mut free, mut ready) =
             (Queue::<Block<u8>, FRAME_RING>::new(), Queue::<Frame, FRAME_RING>::new());
@@ -120,9 +131,8 @@ impl Appliance {
             let _stop = StopOnDrop(shared);
             let records = [plc_in, observer_in];
             let vision = Vision { pipeline, ready: ready_out, free: free_in, records, shared };
-            let vision = spawn(scope, "vision", move || vision.run())?;
-            let waker = vision.thread().clone();
-            let capture = Capture { source, pace, free: free_out, ready: ready_in, shared, waker };
+            let vision = spawn(scope, "vision", move || vision.run_on(&realtime))?;
+            let capture = Capture { source, pace, free: free_out, ready: ready_in, shared };
             let capture = spawn(scope, "capture", move || capture.run())?;
             let plc = spawn(scope, "plc", move || {
                 let mut heartbeat = Heartbeat::new();
@@ -191,14 +201,13 @@ struct Capture<'a> {
     free: Consumer<'a, Block<u8>>,
     ready: Producer<'a, Frame>,
     shared: &'a Shared,
-    waker: std::thread::Thread,
 }
 
 impl Capture<'_> {
     fn run(mut self) -> Result<()> {
         let result = self.frames();
         self.shared.source_ended.store(true, Ordering::Release);
-        self.waker.unpark();
+        self.shared.wake_vision();
         result
     }
 
@@ -222,7 +231,7 @@ impl Capture<'_> {
             taken += 1;
             // There are no more frames than places in the ring.
             let _ = self.ready.enqueue(Frame { pixels, time });
-            self.waker.unpark();
+            self.shared.wake_vision();
         }
         Ok(())
     }
@@ -258,13 +267,28 @@ struct Vision<'a> {
 }
 
 impl Vision<'_> {
-    fn run(mut self) -> Result<()> {
-        let result = self.frames();
+    /// On a thread of its own, or, with several workers, on a pool of as many.
+    fn run_on(mut self, settings: &Realtime) -> Result<()> {
+        let result = if settings.workers == 1 {
+            realtime::enter(settings, 0).and_then(|()| self.frames())
+        } else {
+            rayon::ThreadPoolBuilder::new()
+                .num_threads(settings.workers)
+                .thread_name(|worker| format!("vision {worker}"))
+                .build()
+                .map_err(|e| Error::failure(format!("cannot start the vision workers: {e}")))
+                .and_then(|pool| {
+                    let entered = pool.broadcast(|c| realtime::enter(settings, c.index()));
+                    entered.into_iter().collect::<Result<Vec<()>>>()?;
+                    pool.install(|| self.frames())
+                })
+        };
         self.shared.vision_ended.store(true, Ordering::Release);
         result
     }
 
     fn frames(&mut self) -> Result<()> {
+        self.shared.vision.get_or_init(std::thread::current);
         let [width, height] = self.pipeline.site().camera.image_size_px;
         let mut overflows = 0;
         loop {

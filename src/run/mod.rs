@@ -8,6 +8,7 @@ pub mod calibrate;
 pub mod demo;
 mod memory;
 pub mod offline;
+mod realtime;
 mod report;
 
 pub use annotate::Annotator;

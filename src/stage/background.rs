@@ -10,6 +10,7 @@ use crate::config::Background as Settings;
 use crate::error::Result;
 
 use crate::kernel::Level;
+use crate::kernel::bands::{self, Jobs, rows_per_band};
 use crate::kernel::scalar::bits::{stride, words};
 use crate::kernel::scalar::mixture::{
     Gain, MATCH_Q8, MINORS, Params, Rate, VARIANCE_NEW, observation,
@@ -56,6 +57,7 @@ struct GainBin {
 /// The background stage.
 pub struct Background {
     level: Level,
+    bands: usize,
     width: usize,
     settings: Settings,
     mean: Block<u16>,
@@ -95,6 +97,7 @@ impl Background {
         [width, height]: [usize; 2],
         settings: Settings,
         level: Level,
+        bands: usize,
         memory: &mut Memory,
     ) -> Result<Self> {
         let mean = memory.take("background.mean", 0)?;
@@ -109,6 +112,7 @@ impl Background {
         let minors = [minor(MINOR_BLOCKS[0])?, minor(MINOR_BLOCKS[1])?];
         Ok(Self {
             level,
+            bands,
             width,
             settings,
             mean,
@@ -137,27 +141,50 @@ impl Background {
         }
         self.frames = self.frames.saturating_add(1);
         let params = self.params();
-        let mut model = Model {
-            mean: &mut self.mean,
-            variance: &mut self.variance,
-            minors: self.minors.each_mut().map(|m| Minors {
-                mean: &mut m.mean,
-                variance: &mut m.variance,
-                weight: &mut m.weight,
-            }),
-            multiple: &mut self.multiple,
+        let level = self.level;
+        let height = self.foreground.len() / words(self.width);
+        let rows = rows_per_band(height, self.bands);
+        let (pixels, words) = (rows * stride(self.width), rows * words(self.width));
+        let mut minors = self.minors.each_mut().map(|m| {
+            (m.mean.chunks_mut(pixels), m.variance.chunks_mut(pixels), m.weight.chunks_mut(pixels))
+        });
+        let mut minor = |k: usize| {
+            let (mean, variance, weight) = &mut minors[k];
+            Some(Minors { mean: mean.next()?, variance: variance.next()?, weight: weight.next()? })
         };
-        let mut masks = Masks {
-            foreground: &mut self.foreground,
-            dark: &mut self.dark,
-            strong: &mut self.strong,
-        };
-        update(self.level, grey, &mut model, hold, &mut masks, &params);
-        for mask in [masks.foreground, masks.dark, masks.strong] {
-            for (bits, seen) in mask.iter_mut().zip(seen) {
-                *bits &= seen;
+        let (mut mean, mut variance) =
+            (self.mean.chunks_mut(pixels), self.variance.chunks_mut(pixels));
+        let mut multiple = self.multiple.chunks_mut(words);
+        let (mut foreground, mut dark, mut strong) = (
+            self.foreground.chunks_mut(words),
+            self.dark.chunks_mut(words),
+            self.strong.chunks_mut(words),
+        );
+        let parts = grey.chunks(pixels).zip(hold.chunks(words)).zip(seen.chunks(words));
+        let mut jobs: Jobs<_> = parts
+            .map_while(|((grey, hold), seen)| {
+                let model = Model {
+                    mean: mean.next()?,
+                    variance: variance.next()?,
+                    minors: [minor(0)?, minor(1)?],
+                    multiple: multiple.next()?,
+                };
+                let masks = Masks {
+                    foreground: foreground.next()?,
+                    dark: dark.next()?,
+                    strong: strong.next()?,
+                };
+                Some((grey, hold, seen, model, masks))
+            })
+            .collect();
+        bands::run(&mut jobs, &|(grey, hold, seen, model, masks)| {
+            update(level, grey, model, hold, masks, &params);
+            for mask in [&mut *masks.foreground, &mut *masks.dark, &mut *masks.strong] {
+                for (bits, seen) in mask.iter_mut().zip(*seen) {
+                    *bits &= seen;
+                }
             }
-        }
+        });
     }
 
     fn params(&self) -> Params {

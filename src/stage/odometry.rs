@@ -12,6 +12,7 @@
 use crate::camera::BeltView;
 use crate::error::Result;
 use crate::kernel::Level;
+use crate::kernel::bands::{self, BANDS_MAX, Jobs, rows_per_band};
 use crate::kernel::scalar::bits::{self, stride};
 use crate::kernel::scalar::texture::{NO_TEXTURE, SUMS_BORDER, Sums};
 use crate::kernel::simd::texture::{correlate, extract};
@@ -54,6 +55,7 @@ pub struct Motion {
 /// The odometry stage.
 pub struct Odometry {
     level: Level,
+    bands: usize,
     mm_per_px: f64,
     width: usize,
     /// First and one-past-last column and row of the zone.
@@ -105,7 +107,8 @@ impl Odometry {
         let n = row * zone[1].len().div_ceil(Self::row_step(&zone));
         plan.add::<i8>("odometry.key", n, "belt texture of the key frame, some of the rows");
         plan.add::<i8>("odometry.current", n, "belt texture of the current frame");
-        plan.add::<i32>("odometry.sums", row + SUMS_BORDER, "running sums of a row");
+        let sums = BANDS_MAX * (row + SUMS_BORDER);
+        plan.add::<i32>("odometry.sums", sums, "running sums of a row, for each band");
     }
 
     /// Not yet locked.
@@ -115,6 +118,7 @@ impl Odometry {
         nominal_mm_per_s: f64,
         speed_error_max: f64,
         level: Level,
+        bands: usize,
         memory: &mut Memory,
     ) -> Result<Self> {
         let zone = Self::zone_px(view, zone);
@@ -122,6 +126,7 @@ impl Odometry {
         let [columns, rows] = zone;
         Ok(Self {
             level,
+            bands,
             row_step,
             mm_per_px: view.mm_per_px,
             width: view.size_px[0],
@@ -201,15 +206,23 @@ impl Odometry {
         let (words, stride) = (bits::words(self.width), stride(self.width));
         let (mean, gain) = background.belt();
         let blocks = Self::blocks(&self.columns);
-        let rows = self.rows.clone().step_by(self.row_step);
-        for (v, out) in rows.zip(self.current.chunks_exact_mut(blocks.len())) {
-            let pixels = v * stride + blocks.start..v * stride + blocks.end;
-            let covered = &covered[v * words..][blocks.start / 64..blocks.end / 64];
-            let belt = (&mean[pixels.clone()], gain);
-            extract(self.level, &grey[pixels], belt, covered, &mut self.sums, out);
-            out[..self.columns.start - blocks.start].fill(NO_TEXTURE);
-            out[self.columns.end - blocks.start..].fill(NO_TEXTURE);
-        }
+        let (columns, first, step) = (self.columns.clone(), self.rows.start, self.row_step);
+        let rows = rows_per_band(self.current.len() / blocks.len(), self.bands);
+        let parts = self.current.chunks_mut(rows * blocks.len());
+        let sums = self.sums.chunks_exact_mut(blocks.len() + SUMS_BORDER);
+        let mut jobs: Jobs<_> = parts.zip(sums).enumerate().collect();
+        let level = self.level;
+        bands::run(&mut jobs, &|(band, (texture, sums))| {
+            for (i, out) in (*band * rows..).zip(texture.chunks_exact_mut(blocks.len())) {
+                let v = first + i * step;
+                let pixels = v * stride + blocks.start..v * stride + blocks.end;
+                let covered = &covered[v * words..][blocks.start / 64..blocks.end / 64];
+                let belt = (&mean[pixels.clone()], gain);
+                extract(level, &grey[pixels], belt, covered, sums, out);
+                out[..columns.start - blocks.start].fill(NO_TEXTURE);
+                out[columns.end - blocks.start..].fill(NO_TEXTURE);
+            }
+        });
     }
 
     /// The best match: near the prediction when locked on a moving belt, else over every speed
@@ -252,11 +265,16 @@ impl Odometry {
 
     /// Normalised correlation of key and current texture, the belt having moved by `shift`.
     fn correlation(&self, shift: isize) -> (f64, u32) {
-        let mut sums = Sums::default();
         let n = Self::blocks(&self.columns).len();
-        for (key, current) in self.key.chunks_exact(n).zip(self.current.chunks_exact(n)) {
-            correlate(self.level, key, current, shift, &mut sums);
-        }
+        let part = rows_per_band(self.key.len() / n, self.bands) * n;
+        let parts = self.key.chunks(part).zip(self.current.chunks(part));
+        let mut jobs: Jobs<_> = parts.map(|part| (part, Sums::default())).collect();
+        bands::run(&mut jobs, &|((key, current), sums)| {
+            for (key, current) in key.chunks_exact(n).zip(current.chunks_exact(n)) {
+                correlate(self.level, key, current, shift, sums);
+            }
+        });
+        let sums = jobs.into_iter().fold(Sums::default(), |all, (_, more)| all.plus(&more));
         let norm = (sums.aa as f64 * sums.bb as f64).sqrt();
         (if norm > 0.0 { sums.ab as f64 / norm } else { 0.0 }, sums.n)
     }

@@ -9,6 +9,7 @@ use crate::camera::{BeltView, Camera};
 use crate::error::Result;
 use crate::image::Plane;
 use crate::kernel::Level;
+use crate::kernel::bands::{self, Jobs, rows_per_band};
 use crate::kernel::scalar::bits::{self, stride, words};
 use crate::kernel::scalar::remap::{GROUP, Source};
 use crate::kernel::simd::remap::remap;
@@ -19,6 +20,7 @@ use nalgebra::Vector3;
 /// The rectification stage.
 pub struct Rectify {
     level: Level,
+    bands: usize,
     size_px: [usize; 2],
     map: Block<Source>,
     seen: Block<u64>,
@@ -40,6 +42,7 @@ impl Rectify {
         camera: &Camera,
         view: &BeltView,
         level: Level,
+        bands: usize,
         memory: &mut Memory,
     ) -> Result<Self> {
         let mut map = memory.take("rectify.map", Source::default())?;
@@ -64,12 +67,17 @@ impl Rectify {
                 }
             }
         }
-        Ok(Self { level, size_px: view.size_px, map, seen, view: memory.take("rectify.view", 0)? })
+        let view_px = memory.take("rectify.view", 0)?;
+        Ok(Self { level, bands, size_px: view.size_px, map, seen, view: view_px })
     }
 
     /// Rectify one frame; `raw` has the camera's image size. Unseen pixels repeat pixel (0, 0).
     pub fn step(&mut self, raw: Plane<'_>) {
-        remap(self.level, raw, &self.map, &mut self.view);
+        let [width, height] = self.size_px;
+        let pixels = rows_per_band(height, self.bands) * stride(width);
+        let parts = self.map.chunks(pixels / GROUP).zip(self.view.chunks_mut(pixels));
+        let mut jobs: Jobs<_> = parts.collect();
+        bands::run(&mut jobs, &|(map, view)| remap(self.level, raw, map, view));
     }
 
     /// The belt view.

@@ -8,7 +8,7 @@
 
 use crate::config::{Limits, Segment as Settings};
 use crate::error::Result;
-use crate::kernel::scalar::bits::{self, dilate, erode, words};
+use crate::kernel::scalar::bits::{self, Square, words};
 use crate::kernel::scalar::runs::{Run, collect, resolve};
 use crate::plan::{Block, Memory, Plan};
 
@@ -93,6 +93,7 @@ impl PxBox {
 /// The segmentation stage.
 pub struct Segment {
     size_px: [usize; 2],
+    bands: usize,
     settings: Settings,
     area_min_px: u32,
     mask: Block<u64>,
@@ -121,11 +122,13 @@ impl Segment {
         size_px: [usize; 2],
         mm_per_px: f64,
         settings: Settings,
+        bands: usize,
         memory: &mut Memory,
     ) -> Result<Self> {
         let area_min_px = (settings.area_min_mm2 / (mm_per_px * mm_per_px)).ceil() as u32;
         Ok(Self {
             size_px,
+            bands,
             settings,
             area_min_px,
             mask: memory.take("segment.mask", 0)?,
@@ -146,12 +149,13 @@ impl Segment {
         for ((bright, all), dark) in self.bright.iter_mut().zip(foreground).zip(dark) {
             *bright = all & !dark;
         }
-        erode(&mut self.bright, &mut self.scratch, width, open);
-        dilate(&mut self.bright, &mut self.scratch, width, open);
+        let square = |radius: usize| Square { width, radius, bands: self.bands };
+        square(open).erode(&mut self.bright, &mut self.scratch);
+        square(open).dilate(&mut self.bright, &mut self.scratch);
         self.mask.copy_from_slice(foreground);
-        erode(&mut self.mask, &mut self.scratch, width, open);
-        dilate(&mut self.mask, &mut self.scratch, width, open + close);
-        erode(&mut self.mask, &mut self.scratch, width, close);
+        square(open).erode(&mut self.mask, &mut self.scratch);
+        square(open + close).dilate(&mut self.mask, &mut self.scratch);
+        square(close).erode(&mut self.mask, &mut self.scratch);
         let found = collect(&self.mask, width, &mut self.runs);
         self.run_count = found.min(self.runs.len());
         let (runs, rest) = self.runs.split_at_mut(self.run_count);
@@ -272,7 +276,7 @@ mod tests {
         Segment::plan(size_px, &Limits::default(), &mut plan);
         let mut memory = plan.reserve(8).expect("small");
         let settings = Settings { area_min_mm2: 4.0, ..Settings::default() };
-        let mut segment = Segment::new(size_px, 1.0, settings, &mut memory).expect("planned");
+        let mut segment = Segment::new(size_px, 1.0, settings, 1, &mut memory).expect("planned");
         let mask = |of: &str| -> Vec<u64> {
             let bit = |(u, c): (usize, char)| u64::from(of.contains(c)) << u;
             rows.iter().map(|row| row.char_indices().map(bit).sum()).collect()

@@ -3,6 +3,9 @@
 //! Bits beyond the width are kept 0. Outside the image counts as 0 for dilation and as 1 for
 //! erosion, so a shape at the border is not eaten from outside (`OpenCV`'s default).
 
+use crate::kernel::bands::{self, Jobs, rows_per_band};
+use std::ops::Range;
+
 /// Words in a row of `width` pixels.
 pub const fn words(width: usize) -> usize {
     width.div_ceil(64)
@@ -51,86 +54,96 @@ fn for_words(start: u16, end: u16, mut visit: impl FnMut(usize, u64)) {
     }
 }
 
-/// Widen every shape of a mask, rows of `width` pixels, by a square of `radius` to all sides.
-/// `scratch` has the mask's size. `radius` is at most 63.
-pub fn dilate(mask: &mut [u64], scratch: &mut [u64], width: usize, radius: usize) {
-    let Some(rows) = along_rows(mask, scratch, width, radius, 0) else { return };
-    across_rows(
-        mask,
-        scratch,
-        width,
-        radius,
-        (rows.start.saturating_sub(radius), rows.end + radius),
-        0,
-    );
+/// A square that masks of `width` pixels a row are filtered with.
+#[derive(Clone, Copy, Debug)]
+pub struct Square {
+    /// Pixels of a row.
+    pub width: usize,
+    /// Pixels to all sides of the middle; at most 63.
+    pub radius: usize,
+    /// Bands of rows that are filtered side by side.
+    pub bands: usize,
 }
 
-/// Narrow every shape: the dilation of the complement, complemented.
-pub fn erode(mask: &mut [u64], scratch: &mut [u64], width: usize, radius: usize) {
-    let Some(rows) = along_rows(mask, scratch, width, radius, u64::MAX) else { return };
-    across_rows(mask, scratch, width, radius, (rows.start, rows.end), u64::MAX);
-}
-
-/// Dilate each row of `mask ^ flip` into `out`, `^ flip`. Returns the rows that are not empty; `None`
-/// when there is nothing to do.
-fn along_rows(
-    mask: &[u64],
-    out: &mut [u64],
-    width: usize,
-    radius: usize,
-    flip: u64,
-) -> Option<std::ops::Range<usize>> {
-    let n = words(width);
-    if n == 0 || radius == 0 {
-        return None;
+impl Square {
+    /// Widen every shape of a mask. `scratch` has its size.
+    pub fn dilate(&self, mask: &mut [u64], scratch: &mut [u64]) {
+        let Some(rows) = self.along_rows(mask, scratch, 0) else { return };
+        let reached = rows.start.saturating_sub(self.radius)..rows.end + self.radius;
+        self.across_rows(mask, scratch, &reached, 0);
     }
-    let last = last_word_mask(width);
-    let mut rows: Option<std::ops::Range<usize>> = None;
-    for (y, (row, out)) in mask.chunks_exact(n).zip(out.chunks_exact_mut(n)).enumerate() {
-        if row.iter().all(|&word| word == 0) {
-            out.fill(0);
-            continue;
-        }
-        rows = Some(rows.map_or(y, |rows| rows.start)..y + 1);
-        let word = |w: usize| {
-            let valid = if w + 1 == n { last } else { u64::MAX };
-            row.get(w).map_or(0, |bits| (bits ^ flip) & valid)
-        };
-        let (mut before, mut here) = (0, word(0));
-        for (w, out) in out.iter_mut().enumerate() {
-            let after = word(w + 1);
-            *out = spread([before, here, after], radius) ^ flip;
-            (before, here) = (here, after);
-        }
-        out[n - 1] &= last;
-    }
-    rows
-}
 
-/// Dilate each column of `src ^ flip` into `mask`, `^ flip`; outside of rows `from..to` there is
-/// nothing.
-fn across_rows(
-    mask: &mut [u64],
-    src: &[u64],
-    width: usize,
-    radius: usize,
-    (from, to): (usize, usize),
-    flip: u64,
-) {
-    let n = words(width);
-    let rows = mask.len() / n;
-    for (y, out) in mask.chunks_exact_mut(n).enumerate() {
-        if y < from || y >= to {
-            out.fill(0);
-            continue;
+    /// Narrow every shape: the dilation of the complement, complemented.
+    pub fn erode(&self, mask: &mut [u64], scratch: &mut [u64]) {
+        let Some(rows) = self.along_rows(mask, scratch, u64::MAX) else { return };
+        self.across_rows(mask, scratch, &rows, u64::MAX);
+    }
+
+    /// Dilate each row of `mask ^ flip` into `out`, `^ flip`. Returns the rows that are not empty;
+    /// `None` when there is nothing to do.
+    fn along_rows(&self, mask: &[u64], out: &mut [u64], flip: u64) -> Option<Range<usize>> {
+        let n = words(self.width);
+        if n == 0 || self.radius == 0 {
+            return None;
         }
-        let near = y.saturating_sub(radius)..(y + radius + 1).min(rows);
-        out.copy_from_slice(&src[y * n..(y + 1) * n]);
-        for row in src[near.start * n..near.end * n].chunks_exact(n) {
-            for (out, bits) in out.iter_mut().zip(row) {
-                *out = ((*out ^ flip) | (bits ^ flip)) ^ flip;
+        let rows = rows_per_band(mask.len() / n, self.bands);
+        let parts = mask.chunks(rows * n).zip(out.chunks_mut(rows * n)).enumerate();
+        let mut jobs: Jobs<_> = parts.map(|(i, part)| (i * rows, part, None)).collect();
+        bands::run(&mut jobs, &|(first, (mask, out), filled)| {
+            let filled_rows = self.along_rows_of_band(mask, out, flip);
+            *filled = filled_rows.map(|rows| *first + rows.start..*first + rows.end);
+        });
+        let filled = jobs.into_iter().filter_map(|(_, _, filled)| filled);
+        filled.reduce(|all, more| all.start..more.end)
+    }
+
+    fn along_rows_of_band(&self, mask: &[u64], out: &mut [u64], flip: u64) -> Option<Range<usize>> {
+        let n = words(self.width);
+        let last = last_word_mask(self.width);
+        let mut filled: Option<Range<usize>> = None;
+        for (y, (row, out)) in mask.chunks_exact(n).zip(out.chunks_exact_mut(n)).enumerate() {
+            if row.iter().all(|&word| word == 0) {
+                out.fill(0);
+                continue;
             }
+            filled = Some(filled.map_or(y, |rows| rows.start)..y + 1);
+            let word = |w: usize| {
+                let valid = if w + 1 == n { last } else { u64::MAX };
+                row.get(w).map_or(0, |bits| (bits ^ flip) & valid)
+            };
+            let (mut before, mut here) = (0, word(0));
+            for (w, out) in out.iter_mut().enumerate() {
+                let after = word(w + 1);
+                *out = spread([before, here, after], self.radius) ^ flip;
+                (before, here) = (here, after);
+            }
+            out[n - 1] &= last;
         }
+        filled
+    }
+
+    /// Dilate each column of `src ^ flip` into `mask`, `^ flip`; outside of the rows `reached`
+    /// there is nothing.
+    fn across_rows(&self, mask: &mut [u64], src: &[u64], reached: &Range<usize>, flip: u64) {
+        let n = words(self.width);
+        let rows = src.len() / n;
+        let each = rows_per_band(rows, self.bands);
+        let mut jobs: Jobs<_> = mask.chunks_mut(each * n).enumerate().collect();
+        bands::run(&mut jobs, &|(band, mask)| {
+            for (y, out) in (*band * each..).zip(mask.chunks_exact_mut(n)) {
+                if !reached.contains(&y) {
+                    out.fill(0);
+                    continue;
+                }
+                let near = y.saturating_sub(self.radius)..(y + self.radius + 1).min(rows);
+                out.copy_from_slice(&src[y * n..(y + 1) * n]);
+                for row in src[near.start * n..near.end * n].chunks_exact(n) {
+                    for (out, bits) in out.iter_mut().zip(row) {
+                        *out = ((*out ^ flip) | (bits ^ flip)) ^ flip;
+                    }
+                }
+            }
+        });
     }
 }
 
@@ -208,15 +221,16 @@ mod tests {
                     for row in src.chunks_mut(n) {
                         row[n - 1] &= last_word_mask(width);
                     }
-                    for radius in [0, 1, 2, 3, 8, 63] {
+                    for (radius, bands) in [(0, 1), (1, 1), (2, 3), (3, 2), (8, 8), (63, 1)] {
+                        let square = Square { width, radius, bands };
                         let mut scratch = vec![0xa5a5; n * rows];
                         let mut out = src.clone();
-                        dilate(&mut out, &mut scratch, width, radius);
+                        square.dilate(&mut out, &mut scratch);
                         let side = radius as i64;
                         let expected = naive(&src, width, rows, side, false);
                         assert_eq!(out, expected, "dilate {width}x{rows} by {radius}");
                         out.copy_from_slice(&src);
-                        erode(&mut out, &mut scratch, width, radius);
+                        square.erode(&mut out, &mut scratch);
                         let expected = naive(&src, width, rows, side, true);
                         assert_eq!(out, expected, "erode {width}x{rows} by {radius}");
                     }

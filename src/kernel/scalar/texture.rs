@@ -68,6 +68,19 @@ pub struct Sums {
     pub n: u32,
 }
 
+impl Sums {
+    /// Both together.
+    #[must_use]
+    pub fn plus(&self, more: &Self) -> Self {
+        Self {
+            ab: self.ab + more.ab,
+            aa: self.aa + more.aa,
+            bb: self.bb + more.bb,
+            n: self.n + more.n,
+        }
+    }
+}
+
 /// The pixels of `key` and `current` that lie on each other when `current` has moved by `shift`.
 pub fn overlap<'a>(key: &'a [i8], current: &'a [i8], shift: isize) -> (&'a [i8], &'a [i8]) {
     let key = key.get((-shift).max(0) as usize..).unwrap_or_default();
