@@ -14,7 +14,7 @@ use crate::kernel::scalar::bits::{self, Square, words};
 use crate::plan::{Block, Memory, Plan};
 use crate::stage::background::Background;
 use crate::stage::measure::{self, Frame, Measure, Measured};
-use crate::stage::odometry::Odometry;
+use crate::stage::odometry::{Motion, Odometry};
 use crate::stage::rectify::Rectify;
 use crate::stage::segment::{PxBox, Segment};
 use crate::stage::track::{Change, NOBODY, Phase, Track, Tracker};
@@ -31,6 +31,8 @@ const HOLD_MARGIN_PX: usize = 2;
 /// carry the parcel's own, faster motion into them.
 const COVER_MARGIN_PX: usize = 8;
 
+/// An encoder that shows less than this share of the nominal speed stands still.
+const STILL: f64 = 0.1;
 /// A blob whose middle is this near to a parcel's silhouette is a piece of that parcel.
 const PIECE_MARGIN_PX: f64 = 8.0;
 
@@ -62,6 +64,9 @@ pub struct Pipeline {
     scratch: Block<u64>,
     references: Block<Reference>,
     at: BeltPosition,
+    /// The encoder's belt position at the coming frame, and at the last one, mm.
+    encoder_mm: [Option<f64>; 2],
+    stands_still: bool,
     last: Option<FrameTime>,
     counters: Counters,
 }
@@ -126,6 +131,8 @@ impl Pipeline {
             scratch: memory.take("pipeline.scratch", 0)?,
             references: memory.take("pipeline.references", nowhere)?,
             at: BeltPosition::default(),
+            encoder_mm: [None; 2],
+            stands_still: false,
             last: None,
             counters: Counters::default(),
             zone,
@@ -157,6 +164,11 @@ impl Pipeline {
         self.cover();
         let motion =
             self.odometry.step(self.rectify.pixels(), &self.background, &self.covered, dt_s);
+        let by_encoder = self.by_encoder();
+        self.stands_still = by_encoder.map_or(self.odometry.stands_still(), |motion| {
+            motion.step_mm.abs() < STILL * self.site.config.belt.speed_mm_per_s * dt_s
+        });
+        let motion = by_encoder.unwrap_or(motion);
         self.at.advance(motion.step_mm, motion.measured);
         self.track(motion.step_mm);
         self.measure_tracks(time, motion.step_mm);
@@ -164,6 +176,19 @@ impl Pipeline {
         self.counters.segment_overflows = self.segment.overflows;
         self.counters.track_overflows = self.tracker.overflows;
         Ok(())
+    }
+
+    /// The belt's position at the next frame, mm from anywhere, as an encoder tells it. It outdoes
+    /// the belt's texture; a frame without it falls back to that.
+    pub fn encoder(&mut self, position_mm: f64) {
+        self.encoder_mm[0] = Some(position_mm).filter(|mm| mm.is_finite());
+    }
+
+    /// The belt's motion since the last frame, if the encoder was read at both.
+    fn by_encoder(&mut self) -> Option<Motion> {
+        let [here, before] = self.encoder_mm;
+        self.encoder_mm = [None, here];
+        Some(Motion { step_mm: here? - before?, measured: true })
     }
 
     /// The input has ended: report what is still inside, flagged unfinished.
@@ -179,7 +204,7 @@ impl Pipeline {
     /// Not to be learned: parcels, or the whole belt at a standstill, when its texture and
     /// whatever stands on it would become background.
     fn hold_background(&mut self) {
-        if self.odometry.stands_still() {
+        if self.stands_still {
             self.hold.fill(u64::MAX);
             return;
         }

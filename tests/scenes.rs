@@ -288,6 +288,42 @@ fn a_belt_without_texture_says_that_its_speed_is_assumed() {
 }
 
 #[test]
+fn dark_parcels_under_light_that_flickers_by_fifteen_percent_are_measured() {
+    // 10 Hz, seen 30 times a second: neighbouring frames differ by up to 25 %.
+    let light = "[light]\ndrift = 0.15\ndrift_period_s = 0.1\nshadow = 0.35\n";
+    let parcels = parcel([285.0, 180.0, 70.0], 24.0, [-1150.0, -120.0], "dark")
+        + &parcel([200.0, 150.0, 120.0], -35.0, [-1600.0, 110.0], "dark");
+    let scenario = scenario(190, 500.0, &(light.to_owned() + &parcels));
+    let pairs = matched(&scenario, &measure(&scenario, 490.0));
+    // Black on a dark belt: two thirds of a pixel more than bright ones.
+    assert_sizes(&pairs, 2.5, HEIGHT_MM);
+}
+
+#[test]
+fn an_encoder_measures_heights_on_a_belt_without_texture_that_stops() {
+    let mut scenario = scenario(
+        230,
+        500.0,
+        &(parcel([235.0, 125.0, 70.0], 12.0, [-1150.0, -100.0], "kraft")
+            + "[[belt.stop]]\nat_s = 2.5\nfor_s = 1.0\nramp_s = 0.3\n"),
+    );
+    scenario.belt.texture_grey = 0.0;
+    let mut source = Synthetic::new(scenario.clone()).expect("renders");
+    let (mut frames, mut pipeline) = run::build(site(&scenario, 475.0)).expect("fits");
+    let mut frame = frames.pop().expect("planned");
+    let [width, height] = source.size_px();
+    let mut records = Vec::new();
+    while let Some(time) = source.next_into(&mut frame).expect("renders") {
+        let raw = Plane::packed(&frame, width, height).expect("this size");
+        pipeline.encoder(1e4 + scenario.travel_at_frame_mm(time.index));
+        pipeline.step(raw, time, &mut |r| records.push(r)).expect("this size");
+    }
+    let pairs = matched(&scenario, &records);
+    assert!(!pairs[0].1.flags.has(Flags::SPEED_ASSUMED), "{:?}", pairs[0].1);
+    assert_sizes(&pairs, FOOTPRINT_MM, HEIGHT_MM);
+}
+
+#[test]
 fn the_same_frames_give_the_same_records() {
     let scenario =
         scenario(120, 500.0, &parcel([200.0, 150.0, 90.0], 50.0, [-900.0, 0.0], "white"));
