@@ -11,7 +11,7 @@
 //! - [`camera`]: lens, pose and belt view; their calibration from a chessboard. Pure.
 //! - [`config`]: TOML to a checked [`config::Site`].
 //! - [`plan`]: all memory of the vision path, named and reasoned, in one mapping.
-//! - [`kernel`]: pixel loops on slices. [`stage`]: the steps that own state.
+//! - [`kernel`]: pixel loops on slices, a readable one and one in vectors. [`stage`]: the steps that own state.
 //! - [`belt`]: where the belt is. [`pipeline`]: the steps in order. [`event`]: what comes out.
 //! - [`source`]: where frames come from. [`plc`]: how records reach the PLC.
 //! - [`run`]: threads and rings; the only room that knows source, pipeline and plc.

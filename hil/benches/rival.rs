@@ -79,7 +79,7 @@ fn stages(scene: &Scene) -> Vec<Pair> {
     let mut segment =
         Segment::new(size, site.view.mm_per_px, segment, 1, &mut memory).expect("planned");
     let mut theirs = Chain::new(site);
-    let mut pairs = ["rectification", "background", "morphology and labels", "copy of that memory"]
+    let mut pairs = ["rectification", "background", "morphology and labels", "model copied; learned"]
         .map(Pair::new);
     // What a parcel covers is not learned, as in the pipeline.
     let mut hold: Vec<u64> = rectify.seen().iter().map(|seen| !seen).collect();
@@ -136,5 +136,5 @@ fn chain(scene: &Scene) {
     println!("{:24} {ours:8.3} ms {other:8.3} ms {:6.1} x", pair.name, other / ours);
     let mut slowest: Vec<(Duration, usize)> = pair.ours.iter().copied().zip(40..).collect();
     slowest.sort_unstable();
-    println!("{parcels} parcels, slowest frames {:?}", &slowest[slowest.len() - 6..]);
+    println!("{parcels} parcels, slowest frames {:?}", &slowest[slowest.len().saturating_sub(6)..]);
 }
