@@ -79,8 +79,9 @@ fn stages(scene: &Scene) -> Vec<Pair> {
     let mut segment =
         Segment::new(size, site.view.mm_per_px, segment, 1, &mut memory).expect("planned");
     let mut theirs = Chain::new(site);
-    let mut pairs = ["rectification", "background", "morphology and labels", "model copied; learned"]
-        .map(Pair::new);
+    let mut pairs =
+        ["rectification", "background", "morphology and labels", "model copied; learned"]
+            .map(Pair::new);
     // What a parcel covers is not learned, as in the pipeline.
     let mut hold: Vec<u64> = rectify.seen().iter().map(|seen| !seen).collect();
     let mut scratch = hold.clone();

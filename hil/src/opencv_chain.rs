@@ -156,6 +156,15 @@ impl Chain {
         .expect("labels");
     }
 
+    /// Pixels of each label.
+    ///
+    /// # Panics
+    /// When `OpenCV` refuses.
+    pub fn areas(&self) -> Vec<i32> {
+        let area = |label| *self.stats.at_2d::<i32>(label, 4).expect("inside");
+        (1..self.stats.rows()).map(area).collect()
+    }
+
     /// Corners in the blobs followed from the last frame, new ones found, and each blob's smallest
     /// rectangle: what a tracker and a measurement need at least.
     ///
