@@ -568,9 +568,12 @@ mod tests {
     #[test]
     fn a_ghost_touched_by_a_parcel_is_left_behind() {
         let mut belt = Belt::new();
-        let ghost = [10.0, 18.0, 10.0, 20.0];
+        // Wider than a frame's travel: else it is out of the box at once.
+        let ghost = [100.0, 130.0, 10.0, 15.0];
         for i in 0..30u8 {
-            belt.frame(STEP_MM, &[at(f32::from(i) * 10.0, 0.0), ghost]);
+            let parcel = at(f32::from(i) * 10.0, 0.0);
+            // It comes to light while the parcel is over it.
+            belt.frame(STEP_MM, &[parcel, ghost][..if i < 10 { 1 } else { 2 }]);
         }
         let riding: Vec<&Track> =
             belt.tracker.tracks().iter().filter(|t| t.phase == Phase::Riding).collect();
