@@ -113,6 +113,7 @@ impl Pipeline {
         let tracker = Tracker::new(view.mm_per_px, magnification_max, memory)?;
         let measure = Measure::new(
             view.clone(),
+            level,
             zone,
             site.height_max_mm,
             measure::Rounding::of_radius(config.measure.edge_radius_mm),
@@ -425,6 +426,21 @@ impl Pipeline {
     /// The belt's motion in the last frame, and whether it was measured.
     pub fn belt_motion(&self) -> (f64, bool) {
         self.odometry.speed()
+    }
+
+    /// The belt view of the last frame.
+    pub fn view(&self) -> Plane<'_> {
+        self.rectify.view()
+    }
+
+    /// Bit mask of the view's pixels that the camera sees.
+    pub fn seen(&self) -> &[u64] {
+        self.rectify.seen()
+    }
+
+    /// Bit mask of the last frame's foreground.
+    pub fn foreground(&self) -> &[u64] {
+        self.background.foreground()
     }
 
     /// The site it was built for.

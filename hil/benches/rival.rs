@@ -8,6 +8,8 @@
 use beltgauge::image::{FrameTime, Plane};
 use beltgauge::kernel::Level;
 use beltgauge::kernel::scalar::bits::{Square, stride};
+use beltgauge::kernel::scalar::runs::{Run, collect, resolve};
+use beltgauge::kernel::simd::corners::{Area, minimum_eigenvalues};
 use beltgauge::plan::Plan;
 use beltgauge::stage::background::Background;
 use beltgauge::stage::rectify::Rectify;
@@ -79,19 +81,28 @@ fn stages(scene: &Scene) -> Vec<Pair> {
     let mut segment =
         Segment::new(size, site.view.mm_per_px, segment, 1, &mut memory).expect("planned");
     let mut theirs = Chain::new(site);
-    let mut pairs =
-        ["rectification", "background", "morphology and labels", "model copied; learned"]
-            .map(Pair::new);
+    let mut pairs = [
+        "rectification",
+        "background",
+        "morphology and labels",
+        "labels alone",
+        "corner scores",
+        "model copied; learned",
+    ]
+    .map(Pair::new);
     // What a parcel covers is not learned, as in the pipeline.
     let mut hold: Vec<u64> = rectify.seen().iter().map(|seen| !seen).collect();
     let mut scratch = hold.clone();
     let square = Square { width: size[0], radius: 2, bands: 1 };
+    let mut runs = vec![Run::default(); site.config.limits.runs_max];
+    let all = Area { u: [0, size[0]], v: [0, size[1]] };
+    let mut best = vec![0.0; size[0] * size[1]];
     let model = vec![7u8; stride(size[0]) * size[1] * 5];
     let mut copy = vec![0u8; model.len()];
     let [width, height] = site.camera.image_size_px;
     for (n, frame) in scene.frames.iter().enumerate() {
         let raw = Plane::packed(frame, width, height).expect("this size");
-        let [remap, learn, label, floor] = &mut pairs;
+        let [remap, learn, label, connect, corners, floor] = &mut pairs;
         timed(&mut remap.ours, || rectify.step(raw));
         timed(&mut remap.theirs, || theirs.rectify(frame));
         timed(&mut learn.ours, || background.step(rectify.pixels(), rectify.seen(), &hold));
@@ -100,6 +111,17 @@ fn stages(scene: &Scene) -> Vec<Pair> {
         let dark = background.dark();
         timed(&mut label.ours, || segment.step(foreground, strong, dark));
         timed(&mut label.theirs, || theirs.label());
+        timed(&mut connect.ours, || {
+            let count = collect(segment.mask(), size[0], &mut runs);
+            resolve(&mut runs[..count])
+        });
+        timed(&mut connect.theirs, || theirs.connect());
+        timed(&mut corners.ours, || {
+            minimum_eigenvalues(level, rectify.view(), all, |u, v, scores| {
+                best[v * size[0] + u..][..scores.len()].copy_from_slice(scores);
+            });
+        });
+        timed(&mut corners.theirs, || theirs.score_corners());
         hold.copy_from_slice(segment.mask());
         square.dilate(&mut hold, &mut scratch);
         for (hold, seen) in hold.iter_mut().zip(rectify.seen()) {

@@ -1,15 +1,20 @@
 //! What Beltgauge does to a frame, done with `OpenCV`: the rival of the benchmarks.
 
 use beltgauge::config::Site;
+use beltgauge::kernel::scalar::flow::SIDE;
 use beltgauge::units::BeltPx;
 use nalgebra::Vector3;
 use opencv::core::{
-    CV_16SC2, CV_32F, CV_32S, Mat, MatTraitConst, Point, Point2f, Ptr, Rect, Scalar, Size,
-    TermCriteria, Vector,
+    CV_16SC2, CV_32F, CV_32S, Mat, MatTraitConst, Point, Point2f, Ptr, Rect, RotatedRect, Scalar,
+    Size, TermCriteria, Vector,
 };
 use opencv::imgproc;
 use opencv::prelude::*;
 use opencv::video::{self, BackgroundSubtractorMOG2};
+
+/// `OpenCV`'s unit of a minimum eigenvalue, (grey levels a px)^2: its gradients are twice the central
+/// difference of values from 0 to 1.
+pub const SCORE_UNIT: f32 = 255.0 * 255.0 / 4.0;
 
 /// The chain's state.
 pub struct Chain {
@@ -25,6 +30,8 @@ pub struct Chain {
     /// Labels, and for each its box and area.
     pub labels: Mat,
     stats: Mat,
+    /// Minimum eigenvalues, in units of its own: see [`SCORE_UNIT`].
+    pub scores: Mat,
     last: Mat,
     corners: Vector<Point2f>,
     close: i32,
@@ -68,6 +75,7 @@ impl Chain {
             mask: Mat::default(),
             labels: Mat::default(),
             stats: Mat::default(),
+            scores: Mat::default(),
             last: Mat::default(),
             corners: Vector::new(),
             close: site.config.segment.close_px as i32,
@@ -172,36 +180,19 @@ impl Chain {
     /// When `OpenCV` refuses.
     pub fn measure(&mut self) {
         if !self.corners.is_empty() {
-            let (mut next, mut status, mut error) =
-                (Vector::<Point2f>::new(), Vector::<u8>::new(), Vector::<f32>::new());
-            video::calc_optical_flow_pyr_lk(
-                &self.last,
-                &self.view,
-                &self.corners,
-                &mut next,
-                &mut status,
-                &mut error,
-                Size::new(13, 13),
-                2,
-                TermCriteria::new(3, 10, 0.01).expect("criteria"),
-                0,
-                1e-4,
-            )
-            .expect("flow");
+            self.follow(&self.last, &self.corners, 0.0);
         }
-        self.corners.clear();
-        imgproc::good_features_to_track(
-            &self.view,
-            &mut self.corners,
-            100,
-            0.01,
-            8.0,
-            &self.mask,
-            3,
-            false,
-            0.04,
-        )
-        .expect("corners");
+        self.corners = self.good_corners();
+        std::hint::black_box(self.rectangles());
+        std::mem::swap(&mut self.last, &mut self.view);
+    }
+
+    /// The smallest rectangle around each blob that is not too small.
+    ///
+    /// # Panics
+    /// When `OpenCV` refuses.
+    pub fn rectangles(&self) -> Vec<RotatedRect> {
+        let mut rectangles = Vec::new();
         for label in 1..self.stats.rows() {
             let of = |column: i32| *self.stats.at_2d::<i32>(label, column).expect("inside");
             if of(4) < self.area_min_px {
@@ -219,10 +210,76 @@ impl Chain {
             )
             .expect("contours");
             for contour in &contours {
-                imgproc::min_area_rect(&contour).expect("a rectangle");
+                let mut rectangle = imgproc::min_area_rect(&contour).expect("a rectangle");
+                rectangle.center.x += area.x as f32;
+                rectangle.center.y += area.y as f32;
+                rectangles.push(rectangle);
             }
         }
-        std::mem::swap(&mut self.last, &mut self.view);
+        rectangles
+    }
+
+    /// The best corners in the mask.
+    ///
+    /// # Panics
+    /// When `OpenCV` refuses.
+    pub fn good_corners(&self) -> Vector<Point2f> {
+        let mut corners = Vector::new();
+        imgproc::good_features_to_track(
+            &self.view,
+            &mut corners,
+            100,
+            0.01,
+            8.0,
+            &self.mask,
+            3,
+            false,
+            0.04,
+        )
+        .expect("corners");
+        corners
+    }
+
+    /// Where corners of an earlier view are now, expected `step_px` further along the belt: with the
+    /// window of ours, over a pyramid of three.
+    ///
+    /// # Panics
+    /// When `OpenCV` refuses.
+    pub fn follow(
+        &self,
+        before: &Mat,
+        corners: &Vector<Point2f>,
+        step_px: f32,
+    ) -> Vec<Option<Point2f>> {
+        let mut next: Vector<Point2f> =
+            corners.iter().map(|at| Point2f::new(at.x + step_px, at.y)).collect();
+        let (mut status, mut error) = (Vector::<u8>::new(), Vector::<f32>::new());
+        video::calc_optical_flow_pyr_lk(
+            before,
+            &self.view,
+            corners,
+            &mut next,
+            &mut status,
+            &mut error,
+            Size::new(SIDE as i32, SIDE as i32),
+            2,
+            TermCriteria::new(3, 10, 0.01).expect("criteria"),
+            video::OPTFLOW_USE_INITIAL_FLOW,
+            1e-4,
+        )
+        .expect("flow");
+        next.iter().zip(&status).map(|(at, found)| (found == 1).then_some(at)).collect()
+    }
+
+    /// How good a corner each pixel of the view is, over the same patch and by the same gradient
+    /// as ours: 13 pixels wide, central differences.
+    ///
+    /// # Panics
+    /// When `OpenCV` refuses.
+    pub fn score_corners(&mut self) {
+        let border = opencv::core::BORDER_DEFAULT;
+        imgproc::corner_min_eigen_val(&self.view, &mut self.scores, SIDE as i32, 1, border)
+            .expect("scores");
     }
 
     /// One frame.

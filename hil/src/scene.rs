@@ -14,6 +14,8 @@ pub struct Scene {
     pub site: Site,
     /// Raw frames.
     pub frames: Vec<Vec<u8>>,
+    /// Where they come from.
+    pub source: Synthetic,
 }
 
 impl Scene {
@@ -23,6 +25,16 @@ impl Scene {
     /// # Panics
     /// When the scenario cannot be rendered: then nothing can be measured.
     pub fn reference(width: usize, frames: u64) -> Self {
+        let parcels = "[random]\ncount = 40\nfirst_x_mm = -1500\ngap_mm = [160, 260]\n\
+             y_mm = [-400, 400]\nlength_mm = [80, 400]\nwidth_mm = [60, 300]\nheight_mm = [20, 250]\n";
+        Self::reference_with(width, frames, parcels)
+    }
+
+    /// The same with other parcels: the scenario's `[[parcel]]` tables.
+    ///
+    /// # Panics
+    /// When the scenario cannot be rendered.
+    pub fn reference_with(width: usize, frames: u64, parcels: &str) -> Self {
         let scale = width as f64 / 1920.0;
         let height = (1200.0 * scale).round() as usize;
         let text = format!(
@@ -32,29 +44,36 @@ impl Scene {
              distortion = [-0.181, 0.080, 0.0005, -0.0004, -0.008]\n[camera.pose]\n\
              rotation = [[1, 0, 0], [0, -1, 0], [0, 0, -1]]\ntranslation_mm = [0, 0, 1500]\n\
              [belt]\nspeed_mm_per_s = 500\nwidth_mm = 1400\ngrey = 45\ntexture_grey = 1.3\n\
-             [light]\ndrift = 0.05\ndrift_period_s = 3.0\nshadow = 0.35\n\
-             [random]\ncount = 40\nfirst_x_mm = -1500\ngap_mm = [160, 260]\ny_mm = [-400, 400]\n\
-             length_mm = [80, 400]\nwidth_mm = [60, 300]\nheight_mm = [20, 250]\n",
+             [light]\ndrift = 0.05\ndrift_period_s = 3.0\nshadow = 0.35\n{parcels}",
             frames + WARM_UP,
             1019.3 * scale,
             1019.9 * scale,
             940.2 * scale,
             599.1 * scale
         );
-        let scenario = Scenario::parse(&text).expect("a valid scenario");
+        Self::render(Scenario::parse(&text).expect("a valid scenario"))
+    }
+
+    /// All frames of a scenario; the whole image is the zone.
+    ///
+    /// # Panics
+    /// When it cannot be rendered.
+    pub fn render(scenario: Scenario) -> Self {
         let site = whole_image(&scenario);
+        let frames = scenario.frames;
         let mut source = Synthetic::new(scenario).expect("renders");
+        let [width, height] = source.size_px();
         let mut rendered = Vec::new();
-        for n in 0..frames + WARM_UP {
+        for n in 0..frames {
             if n % 20 == 0 {
-                eprint!("\rrendering frame {n} of {}", frames + WARM_UP);
+                eprint!("\rrendering frame {n} of {frames}");
             }
             let mut frame = vec![0; width * height];
             source.next_into(&mut frame).expect("renders");
             rendered.push(frame);
         }
         eprintln!("\r{:60}\r", "");
-        Self { site, frames: rendered }
+        Self { site, frames: rendered, source }
     }
 }
 

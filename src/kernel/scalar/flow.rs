@@ -8,7 +8,8 @@ use crate::image::Plane;
 
 /// Half the side of a patch, px.
 pub const HALF: usize = 6;
-const SIDE: usize = 2 * HALF + 1;
+/// Side of a patch, px.
+pub const SIDE: usize = 2 * HALF + 1;
 const BORDERED: usize = SIDE + 2;
 /// Iterations, and the step in px below which no more are needed.
 const ITERATIONS: usize = 10;
@@ -67,8 +68,8 @@ impl Patch {
     /// The smaller eigenvalue of the mean structure tensor, (grey levels a px)^2: how well the
     /// patch can be located in its worst direction.
     pub fn minimum_eigenvalue(&self) -> f32 {
-        let [xx, xy, yy] = self.tensor().map(|sum| sum / (SIDE * SIDE) as f32);
-        0.5 * (xx + yy - (xx - yy).hypot(2.0 * xy))
+        // Whole numbers below 2^24, as everything that is summed here.
+        minimum_eigenvalue(self.tensor().map(|sum| 4.0 * sum))
     }
 
     /// Where the patch is in `image`, expected at `near` (its centre, px). `None` when it is
@@ -110,6 +111,15 @@ impl Patch {
         let both = seen.iter().zip(self.places()).map(|(s, (grey, _))| (s - here) * (grey - mean));
         (both.sum::<f32>() > CORRELATION_MIN * own * other).then_some(at)
     }
+}
+
+/// The smaller eigenvalue of a patch's mean structure tensor, from the sums of products of the
+/// doubled gradient: xx, xy, yy.
+#[inline]
+pub fn minimum_eigenvalue([xx, xy, yy]: [f32; 3]) -> f32 {
+    const SCALE: f32 = 0.5 * 0.25 / (SIDE * SIDE) as f32;
+    let (difference, product) = (xx - yy, 2.0 * xy);
+    SCALE * (xx + yy - (difference * difference + product * product).sqrt())
 }
 
 /// Bilinear samples around `at`; returns their mean.

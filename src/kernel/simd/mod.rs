@@ -5,13 +5,14 @@
 //! The `scalar` kernel of the same name is the specification: the same bits, at every level.
 #![expect(clippy::inline_always, reason = "only inlined code is compiled for its level")]
 
+pub mod corners;
 pub mod mixture;
 pub mod remap;
 pub mod texture;
 
 /// Run a test at every level that this processor has.
 #[cfg(test)]
-pub(crate) fn each_level(test: impl Fn(fearless_simd::Level)) {
+pub(crate) fn each_level(mut test: impl FnMut(fearless_simd::Level)) {
     use fearless_simd::Level;
     let best = Level::new();
     #[cfg(target_arch = "x86_64")]
@@ -22,7 +23,7 @@ pub(crate) fn each_level(test: impl Fn(fearless_simd::Level)) {
             best.as_avx2().map(Level::Avx2),
             best.as_avx512().map(Level::Avx512),
         ];
-        levels.into_iter().flatten().for_each(&test);
+        levels.into_iter().flatten().for_each(&mut test);
     }
     test(best);
 }

@@ -13,6 +13,7 @@ pub use render::Renderer;
 pub use scenario::{Material, Parcel, Scenario};
 
 use super::FrameSource;
+use crate::camera::BeltView;
 use crate::error::Result;
 use crate::image::FrameTime;
 
@@ -36,6 +37,11 @@ impl Synthetic {
     /// The scenario rendered.
     pub fn scenario(&self) -> &Scenario {
         self.renderer.scenario()
+    }
+
+    /// Which pixels of a belt view show a parcel in frame `index`: see [`Renderer::parcel_mask`].
+    pub fn parcel_mask(&mut self, index: u64, view: &BeltView, mask: &mut [bool]) {
+        self.renderer.parcel_mask(index, view, mask);
     }
 
     /// Render frame `index`, with its noise.

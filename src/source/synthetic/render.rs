@@ -7,9 +7,9 @@
 
 use super::random::Random;
 use super::scenario::{Material, Parcel, Scenario};
-use crate::camera::Camera;
+use crate::camera::{BeltView, Camera};
 use crate::error::Result;
-use crate::units::RawPx;
+use crate::units::{BeltPx, RawPx};
 use nalgebra::Vector3;
 
 /// Texture tile: side in texels (a power of two) and their size.
@@ -124,6 +124,21 @@ impl Renderer {
         for solid in &solids {
             self.classify(solid);
             self.draw(solid, light, blur_mm, frame);
+        }
+        self.solids = solids;
+    }
+
+    /// Which pixels of a belt view show a parcel in frame `index`: the true foreground. Row by row;
+    /// a pixel is what its centre shows.
+    pub fn parcel_mask(&mut self, index: u64, view: &BeltView, mask: &mut [bool]) {
+        let travel_mm = self.scenario.travel_at_frame_mm(index);
+        let solids = self.place_solids(travel_mm);
+        let width = view.size_px[0];
+        for (i, shows) in mask.iter_mut().enumerate() {
+            let px = BeltPx { u: (i % width) as f64, v: (i / width) as f64 };
+            let at = view.belt_point(px);
+            let ground = [at.x as f32, at.y as f32];
+            *shows = solids.iter().any(|s| s.meet(self.centre, ground, 0.0).is_some());
         }
         self.solids = solids;
     }

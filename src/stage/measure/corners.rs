@@ -8,16 +8,16 @@
 use super::model::Outline;
 use crate::camera::BeltView;
 use crate::image::Plane;
+use crate::kernel::Level;
 use crate::kernel::scalar::flow::Patch;
+use crate::kernel::simd::corners::{Area, minimum_eigenvalues};
 use crate::units::BeltMm;
-use nalgebra::Vector2;
+use nalgebra::{Matrix2, Vector2};
 
 /// Cells of the top face along and across; the best corner of each is followed.
 const CELLS: [usize; 2] = [5, 4];
 /// Corners of a parcel.
 pub const CORNERS: usize = CELLS[0] * CELLS[1];
-/// Places looked at in each cell, along and across.
-const PLACES: usize = 9;
 /// Corners are chosen this far inside the outline, as a share of the side: its edges are not.
 const INSIDE: f64 = 0.1;
 /// A weaker corner, (grey levels a px)^2, drowns in noise: its mean gradient would be 3 levels.
@@ -143,7 +143,7 @@ pub fn follow(
 /// The best corner of each cell of the top face, unless some are being followed.
 pub fn choose(
     corners: &mut [Corner],
-    view: &BeltView,
+    (view, level): (&BeltView, Level),
     grey: Plane<'_>,
     outline: &Outline,
     travel_mm: f64,
@@ -151,33 +151,75 @@ pub fn choose(
     if corners.iter().any(|c| c.followed) {
         return;
     }
-    let [a, b, _, d] = outline.top.each_ref().map(|v| v.image);
-    let inside = |t: f64| INSIDE + (1.0 - 2.0 * INSIDE) * t;
-    let at = |s: f64, t: f64| a + (b - a) * inside(t) + (d - a) * inside(s);
-    for (k, corner) in corners.iter_mut().enumerate().take(CORNERS) {
-        if corner.views >= VIEWS_MIN {
+    let top = outline.top.each_ref().map(|v| v.image);
+    let Some(best) = best_of_cells(view, level, grey, top) else { return };
+    for (corner, (score, px)) in corners.iter_mut().zip(best) {
+        if corner.views >= VIEWS_MIN || score <= EIGENVALUE_MIN {
             continue;
         }
-        let cell = [k % CELLS[0], k / CELLS[0]];
-        let place = |axis: usize, i: usize| {
-            (cell[axis] as f64 + (i as f64 + 0.5) / PLACES as f64) / CELLS[axis] as f64
-        };
-        let mut best = EIGENVALUE_MIN;
-        for (i, j) in (0..PLACES).flat_map(|i| (0..PLACES).map(move |j| (i, j))) {
-            let Some(px) = pixel(view, at(place(0, i), place(1, j))) else { continue };
-            let Some(patch) = Patch::cut(grey, px[0], px[1]) else { continue };
-            let score = patch.minimum_eigenvalue();
-            if score > best {
-                best = score;
-                *corner = Corner::begin(patch, px, travel_mm);
-            }
+        if let Some(patch) = Patch::cut(grey, px[0], px[1]) {
+            *corner = Corner::begin(patch, px, travel_mm);
         }
     }
 }
 
-fn pixel(view: &BeltView, at: Vector2<f64>) -> Option<[usize; 2]> {
-    let px = view.px(BeltMm { x: at.x, y: at.y });
-    (px.u >= 0.0 && px.v >= 0.0).then_some([px.u.round() as usize, px.v.round() as usize])
+/// Score and place of the best corner of each cell; `None` when the top face has no area.
+fn best_of_cells(
+    view: &BeltView,
+    level: Level,
+    grey: Plane<'_>,
+    top: [Vector2<f64>; 4],
+) -> Option<[(f32, [usize; 2]); CORNERS]> {
+    let cells = Cells::new(view, top)?;
+    let mut best = [(EIGENVALUE_MIN, [0; 2]); CORNERS];
+    minimum_eigenvalues(level, grey, area(view, top), |left, v, scores| {
+        for (u, &score) in (left..).zip(scores) {
+            if score > EIGENVALUE_MIN
+                && let Some(cell) = cells.at([u, v])
+                && score > best[cell].0
+            {
+                best[cell] = (score, [u, v]);
+            }
+        }
+    });
+    Some(best)
+}
+
+/// The pixels around a quadrilateral.
+fn area(view: &BeltView, corners: [Vector2<f64>; 4]) -> Area {
+    let px = corners.map(|at| view.px(BeltMm { x: at.x, y: at.y }));
+    let range = |c: [f64; 4]| {
+        let (low, high) = c.iter().fold((f64::MAX, 0.0f64), |(l, h), &c| (l.min(c), h.max(c)));
+        [low.max(0.0) as usize, high as usize]
+    };
+    Area { u: range(px.map(|px| px.u)), v: range(px.map(|px| px.v)) }
+}
+
+/// The cells that the inside of a top face is divided into, as an affine map from pixels.
+struct Cells {
+    origin: Vector2<f64>,
+    cells_from_px: Matrix2<f64>,
+}
+
+impl Cells {
+    /// Of a top face, its corners in order; `None` when it has no area.
+    fn new(view: &BeltView, [a, b, _, d]: [Vector2<f64>; 4]) -> Option<Self> {
+        let px = |at: Vector2<f64>| view.px(BeltMm { x: at.x, y: at.y });
+        let [a, b, d] = [a, b, d].map(px).map(|px| Vector2::new(px.u, px.v));
+        let sides = [d - a, b - a];
+        let origin = a + (sides[0] + sides[1]) * INSIDE;
+        let cell = |axis: usize| sides[axis] * ((1.0 - 2.0 * INSIDE) / CELLS[axis] as f64);
+        let cells_from_px = Matrix2::from_columns(&[cell(0), cell(1)]).try_inverse()?;
+        Some(Self { origin, cells_from_px })
+    }
+
+    /// The cell that a pixel is in.
+    fn at(&self, px: [usize; 2]) -> Option<usize> {
+        let at = self.cells_from_px * (Vector2::new(px[0] as f64, px[1] as f64) - self.origin);
+        let cell = [at.x.floor(), at.y.floor()];
+        let inside = (0..2).all(|axis| cell[axis] >= 0.0 && cell[axis] < CELLS[axis] as f64);
+        inside.then(|| cell[0] as usize + cell[1] as usize * CELLS[0])
+    }
 }
 
 /// The motion that most corners share; `None` when too few agree.
@@ -203,6 +245,7 @@ pub fn top_motion(corners: &[Corner], zone_length_mm: f64, mm_per_px: f64) -> Op
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::units::BeltPx;
 
     const ZONE_MM: f64 = 1000.0;
     const MM_PER_PX: f64 = 1.5;
@@ -286,6 +329,49 @@ mod tests {
         let ratio = corners[0].ratio(200.0, MM_PER_PX).expect("followed");
         // A twentieth of a pixel over 48.
         assert!((ratio - 1.1).abs() < 0.001 * 1.1, "{ratio}");
+    }
+
+    #[test]
+    fn the_best_corner_of_each_cell_is_chosen_and_none_outside() {
+        const SIZE: usize = 160;
+        let view = BeltView {
+            size_px: [SIZE; 2],
+            mm_per_px: 1.0,
+            origin: BeltMm { x: 0.0, y: 0.0 },
+            nadir: Vector2::new(0.0, 0.0),
+            camera_height_mm: 1500.0,
+        };
+        // A square of 100 px, turned; a speck on every cell's middle, a stronger one outside.
+        let px =
+            |s: f64, t: f64| Vector2::new(30.0 + 96.0 * s + 28.0 * t, 20.0 + 28.0 * s + 96.0 * t);
+        let mut data = vec![60u8; SIZE * SIZE];
+        let mut speck = |at: Vector2<f64>, grey: u8| {
+            let (u, v) = (at.x.round() as usize, at.y.round() as usize);
+            (v - 1..=v + 1).for_each(|v| data[v * SIZE + u - 1..=v * SIZE + u + 1].fill(grey));
+            [u, v]
+        };
+        let inside = |t: f64| INSIDE + (1.0 - 2.0 * INSIDE) * t;
+        let middle = |k: usize, axis: usize| (k as f64 + 0.5) / CELLS[axis] as f64;
+        let places: Vec<[usize; 2]> = (0..CORNERS)
+            .map(|k| {
+                let (s, t) = (middle(k % CELLS[0], 0), middle(k / CELLS[0], 1));
+                speck(px(inside(s), inside(t)), 160)
+            })
+            .collect();
+        speck(px(-0.15, 0.5), 255);
+        let grey = Plane::packed(&data, SIZE, SIZE).expect("square");
+        let belt = |s: f64, t: f64| {
+            let at = px(s, t);
+            view.belt_point(BeltPx { u: at.x, v: at.y })
+        };
+        let top = [(0.0, 0.0), (0.0, 1.0), (1.0, 1.0), (1.0, 0.0)].map(|(s, t)| belt(s, t));
+        let top = top.map(|at| Vector2::new(at.x, at.y));
+        let best = best_of_cells(&view, Level::new(), grey, top).expect("has an area");
+        for ((score, [u, v]), place) in best.into_iter().zip(places) {
+            // A speck is as good a corner wherever in the patch it is.
+            let away = u.abs_diff(place[0]).max(v.abs_diff(place[1]));
+            assert!(score > EIGENVALUE_MIN && away <= 6, "{u} {v}: {place:?}");
+        }
     }
 
     #[test]

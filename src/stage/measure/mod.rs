@@ -22,6 +22,7 @@ pub use observe::Frame;
 use crate::belt::BeltPosition;
 use crate::camera::BeltView;
 use crate::error::Result;
+use crate::kernel::Level;
 use crate::kernel::scalar::runs::Run;
 use crate::plan::{Block, Memory, Plan};
 use crate::units::BeltRect;
@@ -106,6 +107,7 @@ impl Pass {
 /// The measuring stage: a pass for every track slot.
 pub struct Measure {
     geometry: BeltView,
+    level: Level,
     zone: BeltRect,
     height_max_mm: f64,
     rounding: Rounding,
@@ -130,6 +132,7 @@ impl Measure {
     /// No passes yet.
     pub fn new(
         geometry: BeltView,
+        level: Level,
         zone: BeltRect,
         height_max_mm: f64,
         rounding: Rounding,
@@ -138,6 +141,7 @@ impl Measure {
     ) -> Result<Self> {
         Ok(Self {
             geometry,
+            level,
             zone,
             height_max_mm,
             rounding,
@@ -179,7 +183,8 @@ impl Measure {
             corners::follow(corners, &self.geometry, frame.grey, at.travel_mm, ratio);
             // Chosen once the estimate is new: an early, wrong one predicts wrong places.
             if pass.since_fit == 0 {
-                corners::choose(corners, &self.geometry, frame.grey, &outline, at.travel_mm);
+                let view = (&self.geometry, self.level);
+                corners::choose(corners, view, frame.grey, &outline, at.travel_mm);
             }
         }
         let reach_count = view.reach_count();
