@@ -1,11 +1,12 @@
 //! After start-up the capture and vision threads allocate nothing.
 #![allow(unsafe_code)] // a counting allocator cannot be written without
 
+use beltgauge::config::{Config, Site};
 use beltgauge::error::Result;
 use beltgauge::image::FrameTime;
 use beltgauge::run::{Appliance, Pace, demo};
 use beltgauge::source::FrameSource;
-use beltgauge::source::synthetic::Synthetic;
+use beltgauge::source::synthetic::{Scenario, Synthetic};
 use std::alloc::{GlobalAlloc, Layout, System};
 use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
 
@@ -55,15 +56,23 @@ unsafe impl GlobalAlloc for Counting {
 #[global_allocator]
 static ALLOCATOR: Counting = Counting;
 
-/// Arms the counter from the tenth frame to the last: start-up is over by then.
+/// Arms the counter from the tenth frame on: start-up is over by then.
 struct Watched {
     belt: Synthetic,
     frames: u64,
+    last: u64,
     leak: bool,
+    /// Resident memory after a tenth of the frames, and after all of them.
+    resident_kib: [u64; 2],
 }
 
 const FIRST: u64 = 10;
-const LAST: u64 = FIRST + 500;
+
+impl Watched {
+    fn new(belt: Synthetic, last: u64) -> Self {
+        Self { belt, frames: 0, last, leak: false, resident_kib: [0; 2] }
+    }
+}
 
 impl FrameSource for Watched {
     fn size_px(&self) -> [usize; 2] {
@@ -74,26 +83,34 @@ impl FrameSource for Watched {
     }
     fn next_into(&mut self, frame: &mut [u8]) -> Result<Option<FrameTime>> {
         self.frames += 1;
-        ARMED.store((FIRST..LAST).contains(&self.frames), Ordering::Relaxed);
+        ARMED.store(false, Ordering::Relaxed);
+        let moments = [self.last / 10, self.last];
+        if let Some(moment) = moments.iter().position(|moment| *moment == self.frames) {
+            self.resident_kib[moment] = resident_kib();
+        }
+        ARMED.store((FIRST..self.last).contains(&self.frames), Ordering::Relaxed);
         if self.leak {
             drop(std::hint::black_box(vec![0u8; 100]));
         }
-        if self.frames > LAST { Ok(None) } else { self.belt.next_into(frame) }
+        if self.frames > self.last { Ok(None) } else { self.belt.next_into(frame) }
     }
 }
 
-/// Run the appliance over 510 frames; returns parcels and allocations on both threads.
-fn run(leak: bool, workers: usize) -> (u64, u64, u64) {
+/// This process's resident memory.
+fn resident_kib() -> u64 {
+    let status = std::fs::read_to_string("/proc/self/status").expect("Linux");
+    let line = status.lines().find(|line| line.starts_with("VmRSS:")).expect("Linux");
+    line.split_whitespace().nth(1).and_then(|kib| kib.parse().ok()).expect("a number")
+}
+
+/// Run the appliance over a source; returns parcels and allocations on both threads.
+fn run(source: &mut Watched, mut site: Site, workers: usize) -> (u64, u64, u64) {
     CAPTURE.store(0, Ordering::Relaxed);
     VISION.store(0, Ordering::Relaxed);
-    let scenario = demo::scenario().expect("valid");
-    let mut site = demo::site(&scenario).expect("valid");
     site.config.realtime.workers = workers;
     site.config.modbus.listen = ([127, 0, 0, 1], 0).into();
-    let belt = Synthetic::new(scenario).expect("renders");
-    let mut source = Watched { belt, frames: 0, leak };
     let appliance = Appliance::new(site, Pace::Source).expect("port 0 is free");
-    let progress = appliance.run(&mut source, |_, records| {
+    let progress = appliance.run(source, |_, records| {
         records.for_each(drop);
         true
     });
@@ -102,16 +119,73 @@ fn run(leak: bool, workers: usize) -> (u64, u64, u64) {
     (parcels, CAPTURE.load(Ordering::Relaxed), VISION.load(Ordering::Relaxed))
 }
 
+/// The demo's belt and site.
+fn demo_belt() -> (Synthetic, Site) {
+    let scenario = demo::scenario().expect("valid");
+    let site = demo::site(&scenario).expect("valid");
+    (Synthetic::new(scenario).expect("renders"), site)
+}
+
+/// The reference camera scaled to `width` columns (it has 1920) over an endless belt; the whole
+/// image is the zone.
+fn long_belt(width: usize, frames: u64) -> (Synthetic, Site) {
+    let scale = width as f64 / 1920.0;
+    let text = format!(
+        "seed = 3\nfps = 42\nframes = {frames}\nexposure_ms = 1.0\n\
+         [camera]\nimage_size_px = [{width}, {}]\n[camera.lens]\nmodel = \"brown\"\n\
+         fx_px = {}\nfy_px = {}\ncx_px = {}\ncy_px = {}\ndistortion = [0, 0, 0, 0, 0]\n\
+         [camera.pose]\nrotation = [[1, 0, 0], [0, -1, 0], [0, 0, -1]]\n\
+         translation_mm = [0, 0, 1500]\n\
+         [belt]\nspeed_mm_per_s = 1000\nwidth_mm = 1300\ngrey = 45\ntexture_grey = 1.5\n\
+         [random]\ncount = 400\nfirst_x_mm = -1800\ngap_mm = [250, 350]\ny_mm = [-200, 200]\n\
+         length_mm = [150, 300]\nwidth_mm = [100, 200]\nheight_mm = [40, 150]\n",
+        (1200.0 * scale) as usize,
+        1020.0 * scale,
+        1020.0 * scale,
+        959.5 * scale,
+        599.5 * scale
+    );
+    let scenario = Scenario::parse(&text).expect("valid");
+    let config = "[camera]\ncalibration = \"the scenario's\"\n[belt]\nspeed_mm_per_s = 990\n\
+         [zone]\nx_min_mm = -1400\nx_max_mm = 1400\ny_min_mm = -870\ny_max_mm = 870\n";
+    let config = Config::parse(config).expect("valid");
+    let site = Site::new(config, scenario.camera().expect("valid")).expect("in view");
+    (Synthetic::new(scenario).expect("renders"), site)
+}
+
+/// One test: the counters are the process's.
 #[test]
-fn five_hundred_frames_with_parcels_allocate_nothing() {
-    let (parcels, capture, vision) = run(false, 1);
-    assert!(parcels >= 5, "only {parcels} parcels passed: the test proves nothing");
+fn ten_thousand_frames_with_parcels_allocate_nothing_and_memory_stays_as_it_was_planned() {
+    let base_kib = resident_kib();
+    let (mut belt, site) = long_belt(1920, 100);
+    belt.render(0, &mut vec![0; 1920 * 1200]);
+    let renderer_kib = resident_kib() - base_kib;
+    let mut source = Watched::new(belt, 90);
+    let (_, capture, vision) = run(&mut source, site, 1);
+    assert_eq!((capture, vision), (0, 0), "allocations at the full size");
+    let appliance_kib = source.resident_kib[1] - renderer_kib;
+    eprintln!("resident at 1920x1200: {appliance_kib} KiB besides the renderer's {renderer_kib}");
+    assert!(appliance_kib * 1024 < 64_000_000, "{appliance_kib} KiB");
+    drop(source);
+
+    let (belt, site) = long_belt(320, 10_100);
+    let mut source = Watched::new(belt, 10_010);
+    let (parcels, capture, vision) = run(&mut source, site, 1);
+    assert!(parcels >= 300, "only {parcels} parcels passed: the test proves nothing");
     assert_eq!((capture, vision), (0, 0), "allocations on the capture and vision threads");
+    let [early_kib, late_kib] = source.resident_kib;
+    eprintln!("resident after 1000 frames {early_kib} KiB, after 10,000 {late_kib} KiB");
+    // A page or two of stack that was not touched before; 16 bytes a frame would be 140 KiB.
+    assert!(late_kib <= early_kib + 64, "grew from {early_kib} to {late_kib} KiB");
+
     // Two workers: the threads are called "vision 0" and "vision 1".
-    let (more_parcels, capture, vision) = run(false, 2);
-    assert!(more_parcels >= 5, "only {more_parcels} parcels passed with two workers");
+    let (belt, site) = demo_belt();
+    let (parcels, capture, vision) = run(&mut Watched::new(belt, 510), site, 2);
+    assert!(parcels >= 5, "only {parcels} parcels passed with two workers");
     assert_eq!((capture, vision), (0, 0), "allocations with two workers");
     // The counter counts: one allocation and one release a frame while armed.
-    let (_, capture, _) = run(true, 1);
+    let (belt, site) = demo_belt();
+    let mut leaking = Watched { leak: true, ..Watched::new(belt, 510) };
+    let (_, capture, _) = run(&mut leaking, site, 1);
     assert!(capture >= 500, "the counter saw only {capture} planted allocations");
 }

@@ -7,7 +7,6 @@
 
 use beltgauge::image::{FrameTime, Plane};
 use beltgauge::kernel::scalar::bits::{self, words};
-use beltgauge::pipeline::Pipeline;
 use beltgauge::source::synthetic::Scenario;
 use hil::scene::{FPS, Scene};
 use opencv::bgsegm;

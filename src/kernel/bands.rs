@@ -27,6 +27,16 @@ pub fn run<J: Send>(jobs: &mut [J], work: &(impl Fn(&mut J) + Sync)) {
     }
 }
 
+/// Do two different things, side by side when there is more than one band.
+pub fn join(bands: usize, one: impl FnOnce() + Send, other: impl FnOnce() + Send) {
+    if bands > 1 {
+        rayon::join(one, other);
+    } else {
+        one();
+        other();
+    }
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;

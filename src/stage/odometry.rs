@@ -247,11 +247,19 @@ impl Odometry {
     /// The best interior shift of a range, to a hundredth of a pixel.
     fn best(&self, from: f64, to: f64) -> Option<Match> {
         let (from, to) = (from.floor() as isize, to.ceil() as isize);
+        // The peak is most often in the middle of a short range: then its surroundings are known.
+        let start = from.min(from.midpoint(to) - PEAK_HALF);
         let mut best: Option<(isize, f64, u32)> = None;
-        for shift in from..=to {
-            let (rho, pairs) = self.correlation(shift);
-            if pairs >= PAIRS_MIN && best.is_none_or(|(_, r, _)| rho > r) {
-                best = Some((shift, rho, pairs));
+        let mut known = (start, self.correlations(start));
+        for first in (start..=to).step_by(PEAK_SHIFTS) {
+            if first != known.0 {
+                known = (first, self.correlations(first));
+            }
+            for (shift, (rho, pairs)) in (first..=to).zip(known.1) {
+                let better = pairs >= PAIRS_MIN && best.is_none_or(|(_, r, _)| rho > r);
+                if shift >= from && better {
+                    best = Some((shift, rho, pairs));
+                }
             }
         }
         let (shift, rho, pairs) = best?;
@@ -259,24 +267,32 @@ impl Odometry {
         if rho < MATCH_MIN || shift == from || shift == to {
             return None;
         }
-        let around = std::array::from_fn(|k| self.correlation(shift + k as isize - PEAK_HALF).0);
+        if shift - PEAK_HALF != known.0 {
+            known.1 = self.correlations(shift - PEAK_HALF);
+        }
+        let around = known.1.map(|(rho, _)| rho);
         Some(Match { shift_px: shift as f64 + peak(&around)?, pairs })
     }
 
-    /// Normalised correlation of key and current texture, the belt having moved by `shift`.
-    fn correlation(&self, shift: isize) -> (f64, u32) {
+    /// Normalised correlation of key and current texture, and the pixels that took part, the belt
+    /// having moved by `first` px, `first + 1` and so on.
+    fn correlations(&self, first: isize) -> [(f64, u32); PEAK_SHIFTS] {
         let n = Self::blocks(&self.columns).len();
         let part = rows_per_band(self.key.len() / n, self.bands) * n;
         let parts = self.key.chunks(part).zip(self.current.chunks(part));
-        let mut jobs: Jobs<_> = parts.map(|part| (part, Sums::default())).collect();
+        let mut jobs: Jobs<_> = parts.map(|part| (part, [Sums::default(); PEAK_SHIFTS])).collect();
         bands::run(&mut jobs, &|((key, current), sums)| {
             for (key, current) in key.chunks_exact(n).zip(current.chunks_exact(n)) {
-                correlate(self.level, key, current, shift, sums);
+                for (shift, sums) in (first..).zip(&mut *sums) {
+                    correlate(self.level, key, current, shift, sums);
+                }
             }
         });
-        let sums = jobs.into_iter().fold(Sums::default(), |all, (_, more)| all.plus(&more));
-        let norm = (sums.aa as f64 * sums.bb as f64).sqrt();
-        (if norm > 0.0 { sums.ab as f64 / norm } else { 0.0 }, sums.n)
+        std::array::from_fn(|k| {
+            let sums = jobs.iter().fold(Sums::default(), |all, (_, more)| all.plus(&more[k]));
+            let norm = (sums.aa as f64 * sums.bb as f64).sqrt();
+            (if norm > 0.0 { sums.ab as f64 / norm } else { 0.0 }, sums.n)
+        })
     }
 }
 

@@ -8,6 +8,7 @@
 
 use crate::config::{Limits, Segment as Settings};
 use crate::error::Result;
+use crate::kernel::bands;
 use crate::kernel::scalar::bits::{self, Square, words};
 use crate::kernel::scalar::runs::{Run, collect, resolve};
 use crate::plan::{Block, Memory, Plan};
@@ -98,7 +99,7 @@ pub struct Segment {
     area_min_px: u32,
     mask: Block<u64>,
     bright: Block<u64>,
-    scratch: Block<u64>,
+    scratch: [Block<u64>; 2],
     runs: Block<Run>,
     run_count: usize,
     blobs: Block<Blob>,
@@ -112,7 +113,9 @@ impl Segment {
     pub fn plan([width, height]: [usize; 2], limits: &Limits, plan: &mut Plan) {
         plan.add::<u64>("segment.mask", words(width) * height, "mask after opening and closing");
         plan.add::<u64>("segment.bright", words(width) * height, "foreground without dark parts");
-        plan.add::<u64>("segment.scratch", words(width) * height, "the other half of each filter");
+        for scratch in ["segment.scratch", "segment.scratch_bright"] {
+            plan.add::<u64>(scratch, words(width) * height, "the other half of each filter");
+        }
         plan.add::<Run>("segment.runs", limits.runs_max, "limits.runs_max");
         plan.add::<Blob>("segment.blobs", limits.blobs_max, "limits.blobs_max");
     }
@@ -133,7 +136,10 @@ impl Segment {
             area_min_px,
             mask: memory.take("segment.mask", 0)?,
             bright: memory.take("segment.bright", 0)?,
-            scratch: memory.take("segment.scratch", 0)?,
+            scratch: [
+                memory.take("segment.scratch", 0)?,
+                memory.take("segment.scratch_bright", 0)?,
+            ],
             runs: memory.take("segment.runs", Run::default())?,
             run_count: 0,
             blobs: memory.take("segment.blobs", Blob::default())?,
@@ -146,16 +152,25 @@ impl Segment {
     pub fn step(&mut self, foreground: &[u64], strong: &[u64], dark: &[u64]) {
         let (open, close) = (self.settings.open_px, self.settings.close_px);
         let width = self.size_px[0];
-        for ((bright, all), dark) in self.bright.iter_mut().zip(foreground).zip(dark) {
-            *bright = all & !dark;
-        }
-        let square = |radius: usize| Square { width, radius, bands: self.bands };
-        square(open).erode(&mut self.bright, &mut self.scratch);
-        square(open).dilate(&mut self.bright, &mut self.scratch);
-        self.mask.copy_from_slice(foreground);
-        square(open).erode(&mut self.mask, &mut self.scratch);
-        square(open + close).dilate(&mut self.mask, &mut self.scratch);
-        square(close).erode(&mut self.mask, &mut self.scratch);
+        let Self { bright, mask, scratch: [scratch, scratch_bright], .. } = self;
+        // Side by side: a filter alone is too short to be worth the call of another thread.
+        let square = |radius: usize| Square { width, radius, bands: self.bands.div_ceil(2) };
+        bands::join(
+            self.bands,
+            || {
+                mask.copy_from_slice(foreground);
+                square(open).erode(mask, scratch);
+                square(open + close).dilate(mask, scratch);
+                square(close).erode(mask, scratch);
+            },
+            || {
+                for ((bright, all), dark) in bright.iter_mut().zip(foreground).zip(dark) {
+                    *bright = all & !dark;
+                }
+                square(open).erode(bright, scratch_bright);
+                square(open).dilate(bright, scratch_bright);
+            },
+        );
         let found = collect(&self.mask, width, &mut self.runs);
         self.run_count = found.min(self.runs.len());
         let (runs, rest) = self.runs.split_at_mut(self.run_count);
