@@ -35,21 +35,13 @@ impl Scene {
     /// # Panics
     /// When the scenario cannot be rendered.
     pub fn reference_with(width: usize, frames: u64, parcels: &str) -> Self {
-        let scale = width as f64 / 1920.0;
-        let height = (1200.0 * scale).round() as usize;
+        let camera = camera_file(width).replace("[lens]", "[camera.lens]");
         let text = format!(
             "seed = 11\nfps = {FPS}\nframes = {}\nexposure_ms = 1.0\n\
-             [camera]\nimage_size_px = [{width}, {height}]\n[camera.lens]\nmodel = \"brown\"\n\
-             fx_px = {}\nfy_px = {}\ncx_px = {}\ncy_px = {}\n\
-             distortion = [-0.181, 0.080, 0.0005, -0.0004, -0.008]\n[camera.pose]\n\
-             rotation = [[1, 0, 0], [0, -1, 0], [0, 0, -1]]\ntranslation_mm = [0, 0, 1500]\n\
-             [belt]\nspeed_mm_per_s = 500\nwidth_mm = 1400\ngrey = 45\ntexture_grey = 1.3\n\
+             [camera]\n{}\n[belt]\nspeed_mm_per_s = 500\nwidth_mm = 1400\ngrey = 45\ntexture_grey = 1.3\n\
              [light]\ndrift = 0.05\ndrift_period_s = 3.0\nshadow = 0.35\n{parcels}",
             frames + WARM_UP,
-            1019.3 * scale,
-            1019.9 * scale,
-            940.2 * scale,
-            599.1 * scale
+            camera.replace("[pose]", "[camera.pose]"),
         );
         Self::render(Scenario::parse(&text).expect("a valid scenario"))
     }
@@ -75,6 +67,22 @@ impl Scene {
         eprintln!("\r{:60}\r", "");
         Self { site, frames: rendered, source }
     }
+}
+
+/// The calibration file of the reference camera scaled to `width` columns.
+pub fn camera_file(width: usize) -> String {
+    let scale = width as f64 / 1920.0;
+    format!(
+        "image_size_px = [{width}, {}]\n[lens]\nmodel = \"brown\"\n\
+         fx_px = {}\nfy_px = {}\ncx_px = {}\ncy_px = {}\n\
+         distortion = [-0.181, 0.080, 0.0005, -0.0004, -0.008]\n[pose]\n\
+         rotation = [[1, 0, 0], [0, -1, 0], [0, 0, -1]]\ntranslation_mm = [0, 0, 1500]\n",
+        (1200.0 * scale).round(),
+        1019.3 * scale,
+        1019.9 * scale,
+        940.2 * scale,
+        599.1 * scale
+    )
 }
 
 /// Frames of the empty belt before the first parcel: 1.1 m of it are out of view at first.

@@ -56,6 +56,9 @@ fn not_permitted(what: &str, why: impl std::fmt::Display) -> Error {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use rustix::mm::munlockall;
+    use rustix::process::{Resource, Rlimit, getrlimit, setrlimit};
+    use rustix::thread::{CapabilitySet, capabilities, set_capabilities};
 
     #[test]
     fn nothing_asked_for_is_always_permitted() {
@@ -69,5 +72,62 @@ mod tests {
         let error = std::thread::spawn(move || enter(&settings, 1)).join().expect("no panic");
         let text = error.expect_err("no machine has as many").to_string();
         assert!(text.contains("realtime.first_processor = 1000, processor 1001"), "{text}");
+    }
+
+    /// Call on a thread of its own that lacks these capabilities.
+    fn without<T: Send>(lost: CapabilitySet, call: impl FnOnce() -> T + Send) -> T {
+        let call = || {
+            let mut sets = capabilities(None).expect("Linux");
+            sets.effective -= lost;
+            set_capabilities(None, sets).expect("fewer are always permitted");
+            call()
+        };
+        std::thread::scope(|scope| scope.spawn(call).join().expect("no panic"))
+    }
+
+    fn may(capability: CapabilitySet) -> bool {
+        capabilities(None).expect("Linux").effective.contains(capability)
+    }
+
+    #[test]
+    fn a_priority_is_had_with_the_permission_and_refused_without() {
+        let settings = Realtime { priority: 10, ..Realtime::default() };
+        let refused = without(CapabilitySet::SYS_NICE, || {
+            setrlimit(Resource::Rtprio, Rlimit { current: Some(0), maximum: Some(0) })
+                .expect("less is always permitted");
+            enter(&settings, 0)
+        });
+        let text = refused.expect_err("not permitted").to_string();
+        assert!(text.contains("realtime.priority = 10"), "{text}");
+        assert!(text.contains("CAP_SYS_NICE"), "{text}");
+        if may(CapabilitySet::SYS_NICE) {
+            let policy = std::thread::scope(|scope| {
+                let entered = scope.spawn(|| {
+                    enter(&settings, 0).expect("permitted");
+                    thread_priority::thread_schedule_policy().expect("known")
+                });
+                entered.join().expect("no panic")
+            });
+            let fifo = ThreadSchedulePolicy::Realtime(RealtimeThreadSchedulePolicy::Fifo);
+            assert_eq!(policy, fifo);
+        }
+    }
+
+    #[test]
+    fn memory_is_locked_with_the_permission_and_refused_without() {
+        let settings = Realtime { lock_memory: true, ..Realtime::default() };
+        let before = getrlimit(Resource::Memlock);
+        setrlimit(Resource::Memlock, Rlimit { current: Some(0), ..before }).expect("less");
+        let refused = without(CapabilitySet::IPC_LOCK, || lock_memory(&settings));
+        setrlimit(Resource::Memlock, before).expect("as before");
+        let text = refused.expect_err("not permitted").to_string();
+        assert!(text.contains("realtime.lock_memory") && text.contains("CAP_IPC_LOCK"), "{text}");
+        if may(CapabilitySet::IPC_LOCK) {
+            lock_memory(&settings).expect("permitted");
+            let status = std::fs::read_to_string("/proc/self/status").expect("Linux");
+            let locked = status.lines().find(|line| line.starts_with("VmLck:")).expect("Linux");
+            munlockall().expect("unlocks");
+            assert!(!locked.ends_with(" 0 kB"), "{locked}");
+        }
     }
 }
