@@ -1,5 +1,6 @@
 //! What leaves the pipeline: parcel records and counters.
 
+use serde::de::{Deserializer, Error as _};
 use serde::ser::{SerializeSeq, Serializer};
 use std::fmt;
 
@@ -100,8 +101,20 @@ impl serde::Serialize for Flags {
     }
 }
 
+impl<'de> serde::Deserialize<'de> for Flags {
+    fn deserialize<D: Deserializer<'de>>(deserializer: D) -> Result<Self, D::Error> {
+        let mut flags = Self::default();
+        for name in <Vec<String> as serde::Deserialize>::deserialize(deserializer)? {
+            let known = Self::ALL.iter().find(|(_, known, _)| *known == name);
+            let (flag, ..) = known.ok_or_else(|| D::Error::custom(format!("flag {name:?}")))?;
+            flags.set(*flag, true);
+        }
+        Ok(flags)
+    }
+}
+
 /// What the parcel looks like.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, serde::Serialize)]
+#[derive(Clone, Copy, Debug, PartialEq, Eq, serde::Serialize, serde::Deserialize)]
 #[serde(rename_all = "lowercase")]
 pub enum Shape {
     /// The edges of a cuboid were found where it says.
@@ -112,7 +125,7 @@ pub enum Shape {
 
 /// One parcel, as it is reported: once, when it leaves the zone. Field order is that of the
 /// JSON line.
-#[derive(Clone, Copy, Debug, PartialEq, serde::Serialize)]
+#[derive(Clone, Copy, Debug, PartialEq, serde::Serialize, serde::Deserialize)]
 pub struct ParcelRecord {
     /// From 1, never skips.
     pub seq: u32,
@@ -146,6 +159,8 @@ pub struct ParcelRecord {
     pub flags: Flags,
     /// Belt travel since start at `frame`: where the parcel is later, follows from it.
     pub belt_travel_mm: f64,
+    /// The belt's motion was told by the encoder when it left.
+    pub by_encoder: bool,
 }
 
 impl ParcelRecord {

@@ -67,6 +67,9 @@ pub struct Pipeline {
     /// The encoder's belt position at the coming frame, and at the last one, mm.
     encoder_mm: [Option<f64>; 2],
     stands_still: bool,
+    /// By the encoder, in the last frame.
+    encoder_speed_mm_per_s: Option<f64>,
+    reporting: bool,
     last: Option<FrameTime>,
     counters: Counters,
 }
@@ -134,6 +137,8 @@ impl Pipeline {
             at: BeltPosition::default(),
             encoder_mm: [None; 2],
             stands_still: false,
+            encoder_speed_mm_per_s: None,
+            reporting: true,
             last: None,
             counters: Counters::default(),
             zone,
@@ -157,7 +162,14 @@ impl Pipeline {
         self.rectify.step(raw);
         self.hold_background();
         self.background.step(self.rectify.pixels(), self.rectify.seen(), &self.hold);
+        let by_encoder = self.encoder_motion();
+        self.encoder_speed_mm_per_s =
+            by_encoder.as_ref().filter(|_| dt_s > 0.0).map(|motion| motion.step_mm / dt_s);
         if !self.background.learned() {
+            let assumed_mm = self.odometry.speed().0 * dt_s;
+            let (step_mm, measured) =
+                by_encoder.map_or((assumed_mm, false), |motion| (motion.step_mm, true));
+            self.at.advance(step_mm, measured);
             return Ok(());
         }
         let background = &self.background;
@@ -165,7 +177,6 @@ impl Pipeline {
         self.cover();
         let motion =
             self.odometry.step(self.rectify.pixels(), &self.background, &self.covered, dt_s);
-        let by_encoder = self.by_encoder();
         self.stands_still = by_encoder.map_or(self.odometry.stands_still(), |motion| {
             motion.step_mm.abs() < STILL * self.site.config.belt.speed_mm_per_s * dt_s
         });
@@ -185,8 +196,20 @@ impl Pipeline {
         self.encoder_mm[0] = Some(position_mm).filter(|mm| mm.is_finite());
     }
 
+    /// The belt is empty: forget what it looked like, and the parcels in view, and learn it anew.
+    pub fn learn(&mut self) {
+        self.background.forget();
+        self.tracker.forget();
+        self.odometry.forget();
+    }
+
+    /// Report parcels, or let them pass.
+    pub fn report_parcels(&mut self, reporting: bool) {
+        self.reporting = reporting;
+    }
+
     /// The belt's motion since the last frame, if the encoder was read at both.
-    fn by_encoder(&mut self) -> Option<Motion> {
+    fn encoder_motion(&mut self) -> Option<Motion> {
         let [here, before] = self.encoder_mm;
         self.encoder_mm = [None, here];
         Some(Motion { step_mm: here? - before?, measured: true })
@@ -320,7 +343,7 @@ impl Pipeline {
     }
 
     fn emit(&mut self, slot: usize, flags: Flags, emit: &mut dyn FnMut(ParcelRecord)) {
-        if self.passed_beside(slot) {
+        if self.passed_beside(slot) || !self.reporting {
             return;
         }
         let reference = self.references[slot];
@@ -372,6 +395,7 @@ impl Pipeline {
             shape,
             flags,
             belt_travel_mm: reference.at.travel_mm,
+            by_encoder: self.by_encoder(),
         };
         record.flags.set(Flags::MERGED, track.was_merged());
         record.flags.set(Flags::CLIPPED, self.reaches_out(p));
@@ -425,7 +449,10 @@ impl Pipeline {
 
     /// The belt's motion in the last frame, and whether it was measured.
     pub fn belt_motion(&self) -> (f64, bool) {
-        self.odometry.speed()
+        match self.encoder_speed_mm_per_s {
+            Some(speed_mm_per_s) => (speed_mm_per_s, true),
+            None => self.odometry.speed(),
+        }
     }
 
     /// The belt view of the last frame.
@@ -441,6 +468,11 @@ impl Pipeline {
     /// Bit mask of the last frame's foreground.
     pub fn foreground(&self) -> &[u64] {
         self.background.foreground()
+    }
+
+    /// Whether that was by the encoder.
+    pub fn by_encoder(&self) -> bool {
+        self.encoder_speed_mm_per_s.is_some()
     }
 
     /// The site it was built for.

@@ -48,6 +48,8 @@ identity, same = both(0, 5)
 assert identity == same, (identity, same)
 latest = client.read_holding_registers(100, count=32).registers
 ring = [client.read_holding_registers(200 + 32 * k, count=32).registers for k in range(32)]
+assert not client.write_registers(60, [7]).isError()
+echo = client.read_holding_registers(60, count=1).registers[0]
 json.dump(
     {
         "identity": identity[0],
@@ -55,12 +57,19 @@ json.dump(
         "heartbeat": client.read_holding_registers(10, count=1).registers[0],
         "latest": parcel(latest),
         "ring": [parcel(block) for block in ring if u32(block, 0)],
+        "bits": client.read_discrete_inputs(0, count=32).bits[:2],
+        "status": client.read_holding_registers(11, count=1).registers[0],
+        "identification": client.read_device_information(read_code=2).information[0].decode(),
+        "heartbeat of the PLC": echo,
         "exceptions": {
             "beyond the map": client.read_holding_registers(1224, count=1).exception_code,
             "across its end": client.read_holding_registers(1200, count=125).exception_code,
             "write one": client.write_register(100, 1).exception_code,
             "write many": client.write_registers(100, [1, 2]).exception_code,
-            "coils": client.read_coils(0, count=1).exception_code,
+            "write across the command block's end": client.write_registers(69, [1, 2]).exception_code,
+            "acknowledge what never was": client.write_register(61, 999).exception_code,
+            "bits beyond the words": client.read_coils(32, count=1).exception_code,
+            "write a coil": client.write_coil(0, True).exception_code,
         },
     },
     sys.stdout,

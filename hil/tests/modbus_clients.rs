@@ -53,7 +53,7 @@ fn mbpoll_reads_what_was_measured() {
     assert_eq!(identity, mbpoll(demo.address, 3, 0, 5));
     assert_eq!(
         [0, 1, 2, 3, 4].map(|r| identity[&r]),
-        [0x4247, 0x0100, 0x1234, 0x5678, (-12345i16) as u16]
+        [0x4247, 0x0101, 0x1234, 0x5678, (-12345i16) as u16]
     );
     let empty = mbpoll(demo.address, 4, 100, 32);
     assert!(empty.values().all(|&v| v == 0), "no parcel yet: {empty:?}");
@@ -84,13 +84,20 @@ fn pymodbus_reads_what_was_measured() {
     let expected = [
         ("beyond the map", 2),
         ("across its end", 2),
-        ("write one", 1),
-        ("write many", 1),
-        ("coils", 1),
+        ("write one", 2),
+        ("write many", 2),
+        ("write across the command block's end", 2),
+        ("acknowledge what never was", 3),
+        ("bits beyond the words", 2),
+        ("write a coil", 1),
     ];
     for (what, code) in expected {
         assert_eq!(map["exceptions"][what], code, "{what}");
     }
+    assert_eq!(map["bits"], serde_json::json!([true, true]), "running and ready");
+    assert_eq!(map["status"].as_u64().expect("a number") & 3, 3);
+    assert_eq!(map["identification"], "Beltgauge");
+    assert_eq!(map["heartbeat of the PLC"], 7);
     let ring = map["ring"].as_array().expect("a list");
     assert!(ring.len() >= 3 && ring.contains(&map["latest"]), "{map}");
     let records = demo.records();

@@ -3,7 +3,10 @@
 
 mod schema;
 
-pub use schema::{Background, Config, Limits, Measure, Modbus, Odometry, Realtime, Segment, View};
+pub use schema::{
+    Background, Can, Config, DimensionOrder, Encoder, Limits, Measure, Modbus, Odometry, Plc,
+    Realtime, Segment, View, WordOrder,
+};
 
 use crate::camera::{BeltView, Camera, CameraFile};
 use crate::error::{Error, Result};

@@ -1,14 +1,24 @@
-//! The register map: one table that the server encodes from and the document is printed from.
+//! The register map: one table that the server encodes from and the documents are printed from.
 //!
-//! Input (FC 4) and holding (FC 3) registers are the same image. Two-register values have the
-//! high word first. A parcel block carries its sequence number first and last, so that a
-//! client that reads it in two requests can tell whether it changed in between.
+//! Input (FC 4) and holding (FC 3) registers are the same image. A parcel block carries its
+//! sequence number first and last, so that a client that reads it in two requests can tell whether
+//! it changed in between.
 
-use crate::event::{Counters, Flags, ParcelRecord, Shape};
-use std::fmt::Write;
+use super::table::{Field, fields};
+use crate::config::WordOrder;
+use crate::event::{Counters, ParcelRecord, Shape};
 
-/// Version of the map, major.minor; a client checks the major one.
-pub const MAP_VERSION: u16 = 0x0100;
+/// Versions of the map, major in the high byte; a client checks the major one.
+const V1_0: u16 = 0x0100;
+const V1_1: u16 = 0x0101;
+/// The current one.
+pub const MAP_VERSION: u16 = V1_1;
+/// Address of the registers that a PLC writes, and their number.
+pub const COMMAND: u16 = 60;
+/// Registers that a PLC writes.
+pub const COMMAND_COUNT: u16 = 10;
+/// Address of the oldest parcel that waits to be acknowledged.
+pub const QUEUE_HEAD: u16 = 140;
 /// Registers of one parcel block.
 pub const PARCEL_STRIDE: u16 = 32;
 /// Address of the latest parcel.
@@ -20,49 +30,16 @@ pub const RING_PARCELS: u16 = 32;
 /// Registers in all.
 pub const COUNT: u16 = RING + RING_PARCELS * PARCEL_STRIDE;
 
-/// How a value is stored.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub enum Type {
-    /// One register.
-    U16,
-    /// One register, two's complement.
-    I16,
-    /// Two registers, high word first.
-    U32,
-    /// Two registers, two's complement, high word first.
-    I32,
-}
-
-/// One value of a block of type `S`.
-pub struct Field<S> {
-    /// Offset from the block's first register.
-    pub offset: u16,
-    /// Name.
-    pub name: &'static str,
-    /// Storage.
-    pub kind: Type,
-    /// Unit of the value, after scaling.
-    pub unit: &'static str,
-    /// Register value of one unit.
-    pub scale: f64,
-    /// Meaning.
-    pub meaning: &'static str,
-    /// The value, in units.
-    pub value: fn(&S) -> f64,
-}
-
-/// What the status block shows, besides constants.
+/// What the vision thread tells.
 #[derive(Clone, Copy, Debug, Default)]
-#[allow(clippy::struct_excessive_bools)] // they are the bits of two registers
-pub struct Status {
-    /// Rises ten times a second while frames arrive.
-    pub heartbeat: u16,
-    /// Frames arrive.
-    pub running: bool,
+#[allow(clippy::struct_excessive_bools)] // they become bits
+pub struct VisionStatus {
     /// The empty belt has been learned.
     pub ready: bool,
     /// The belt's motion is measured, not assumed.
     pub belt_measured: bool,
+    /// It is measured by the encoder.
+    pub by_encoder: bool,
     /// The frame source has ended or failed.
     pub source_ended: bool,
     /// Belt speed.
@@ -77,7 +54,159 @@ pub struct Status {
     pub counters: Counters,
 }
 
+/// State of the CAN controller.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub enum CanState {
+    /// Not configured.
+    #[default]
+    Off,
+    /// Sends and receives.
+    Active,
+    /// Many errors: nobody acknowledges, or the cable is bad.
+    Passive,
+    /// Too many: the controller has left the bus until it is restarted.
+    BusOff,
+    /// The interface is down or not there.
+    Down,
+}
+
+/// What the CAN side tells.
+#[derive(Clone, Copy, Debug, Default)]
+pub struct CanStatus {
+    /// State of the controller.
+    pub state: CanState,
+    /// Transmit error counter of the controller, when it last told.
+    pub transmit_errors: u8,
+    /// Receive error counter.
+    pub receive_errors: u8,
+    /// How often the bus was lost.
+    pub bus_offs: u64,
+    /// Parcels that no frame could be sent of in time.
+    pub parcels_dropped: u64,
+}
+
+/// What the status block shows.
+#[derive(Clone, Copy, Debug, Default)]
+#[allow(clippy::struct_excessive_bools)] // they are the bits of two registers
+pub struct Status {
+    /// Of the vision thread.
+    pub vision: VisionStatus,
+    /// Of the CAN bus.
+    pub can: CanStatus,
+    /// Rises ten times a second while frames arrive.
+    pub heartbeat: u16,
+    /// Frames arrive.
+    pub running: bool,
+    /// Parcels are not reported, by command.
+    pub stopped: bool,
+    /// The PLC's heartbeat stands still.
+    pub plc_silent: bool,
+    /// An encoder is configured and does not count.
+    pub encoder_silent: bool,
+    /// Starts of the appliance.
+    pub boots: u16,
+    /// Sequence number of the latest parcel.
+    pub sequence: u32,
+    /// Parcels that wait to be acknowledged.
+    pub queued: u16,
+    /// Parcels that left the queue without having been acknowledged.
+    pub queue_overflows: u64,
+    /// Ticket of the last command, and what became of it.
+    pub ticket: u16,
+    /// See [`super::link::Outcome`].
+    pub outcome: u16,
+    /// Scale interval.
+    pub scale_interval_mm: f64,
+}
+
+/// What is wrong or worth knowing, most important first: code and meaning.
+pub const REASONS: [(u16, &str); 12] = [
+    (0, "all is well"),
+    (1, "the frame source has ended or failed"),
+    (2, "no frames arrive"),
+    (3, "a table or queue has been full since start, see the counters"),
+    (4, "a parcel found the queue full and was never acknowledged"),
+    (5, "CAN: bus off"),
+    (6, "CAN: interface down or not there"),
+    (7, "CAN: error passive, nobody acknowledges"),
+    (8, "the encoder does not count"),
+    (9, "the PLC is silent"),
+    (10, "the empty belt is being learned"),
+    (11, "stopped by command"),
+];
+
+impl Status {
+    fn overflows(&self) -> u64 {
+        let c = &self.vision.counters;
+        c.segment_overflows + c.track_overflows + c.event_overflows
+    }
+
+    /// Word of status bits.
+    pub fn status_bits(&self) -> u16 {
+        bits([
+            self.running,
+            self.vision.ready,
+            self.vision.belt_measured,
+            self.vision.by_encoder,
+            self.stopped,
+            self.plc_silent,
+            self.queued > 0,
+        ])
+    }
+
+    /// Word of fault bits.
+    pub fn fault_bits(&self) -> u16 {
+        bits([
+            self.vision.source_ended,
+            self.overflows() > 0,
+            self.queue_overflows > 0,
+            matches!(self.can.state, CanState::BusOff | CanState::Down),
+            self.encoder_silent,
+        ])
+    }
+
+    /// Code of what matters most: see [`REASONS`].
+    pub fn reason(&self) -> u16 {
+        let holds = [
+            self.vision.source_ended,
+            !self.running,
+            self.overflows() > 0,
+            self.queue_overflows > 0,
+            self.can.state == CanState::BusOff,
+            self.can.state == CanState::Down,
+            self.can.state == CanState::Passive,
+            self.encoder_silent,
+            self.plc_silent,
+            !self.vision.ready,
+            self.stopped,
+        ];
+        holds.iter().position(|holds| *holds).map_or(0, |i| i as u16 + 1)
+    }
+}
+
+fn bits<const N: usize>(set: [bool; N]) -> u16 {
+    set.iter().enumerate().map(|(i, set)| u16::from(*set) << i).sum()
+}
+
+/// The registers that a PLC writes, as it last wrote them.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub struct CommandBlock {
+    /// Rises while the PLC is alive.
+    pub heartbeat: u16,
+    /// Low word of the sequence number up to which parcels were taken.
+    pub acknowledge: u16,
+    /// Count of the encoder.
+    pub encoder_count: u32,
+    /// A command is carried out when this changes.
+    pub ticket: u16,
+    /// Code of the command.
+    pub command: u16,
+    /// Its argument.
+    pub argument: u32,
+}
+
 type StatusField = Field<Status>;
+type CommandField = Field<CommandBlock>;
 type ParcelField = Field<ParcelRecord>;
 
 /// Counters wrap at their register's size.
@@ -85,37 +214,50 @@ fn wrapped(count: u64) -> f64 {
     f64::from(count as u32)
 }
 
-/// Rows of the status block: `[offset, name, type, unit, scale, meaning, value]`.
-macro_rules! fields {
-    ($([$offset:expr, $name:expr, $kind:ident, $unit:expr, $scale:expr, $meaning:expr, $value:expr]),* $(,)?) => {
-        &[$(Field {
-            offset: $offset, name: $name, kind: Type::$kind, unit: $unit, scale: $scale,
-            meaning: $meaning, value: $value,
-        }),*]
-    };
-}
-
 /// Identity, status and counters, at address 0.
 #[rustfmt::skip]
 pub const STATUS_FIELDS: &[StatusField] = fields![
-    [0, "identity", U16, "", 1.0, "constant 0x4247, \"BG\"", |_| f64::from(0x4247)],
-    [1, "map_version", U16, "", 1.0, "major in the high byte, minor in the low", |_| f64::from(MAP_VERSION)],
-    [2, "test_u32", U32, "", 1.0, "constant 0x12345678: checks the word order", |_| f64::from(0x1234_5678)],
-    [4, "test_i16", I16, "", 1.0, "constant -12345: checks the sign", |_| -12345.0],
-    [10, "heartbeat", U16, "", 1.0, "rises ten times a second while frames arrive; wraps", |s| f64::from(s.heartbeat)],
-    [11, "status", U16, "bits", 1.0, "bit 0 running, bit 1 ready (belt learned), bit 2 belt motion measured", |s| f64::from(u16::from(s.running) | u16::from(s.ready) << 1 | u16::from(s.belt_measured) << 2)],
-    [12, "fault", U16, "bits", 1.0, "bit 0 frame source ended, bit 1 a table or queue has been full since start (see counters)", |s| f64::from(u16::from(s.source_ended) | u16::from(s.counters.segment_overflows + s.counters.track_overflows + s.counters.event_overflows > 0) << 1)],
-    [13, "belt_speed", U32, "mm/s", 10.0, "belt speed", |s| s.belt_speed_mm_per_s],
-    [15, "frames", U32, "", 1.0, "frames processed; wraps", |s| wrapped(s.counters.frames)],
-    [17, "frames_dropped", U32, "", 1.0, "frames that came too late; wraps", |s| wrapped(s.frames_dropped)],
-    [19, "parcels", U32, "", 1.0, "parcels reported = sequence number of the latest", |s| wrapped(s.counters.parcels)],
-    [21, "parcels_unmeasured", U32, "", 1.0, "parcels that left without a size", |s| wrapped(s.counters.unmeasured)],
-    [23, "parcels_lost", U32, "", 1.0, "parcels that vanished inside the view", |s| wrapped(s.counters.lost)],
-    [25, "segment_overflows", U32, "", 1.0, "frames with more runs or blobs than the tables hold", |s| wrapped(s.counters.segment_overflows)],
-    [27, "track_overflows", U32, "", 1.0, "blobs that found no free track", |s| wrapped(s.counters.track_overflows)],
-    [29, "event_overflows", U32, "", 1.0, "records that found the queue to the PLC full", |s| wrapped(s.counters.event_overflows)],
-    [31, "time", U32, "ms", 1.0, "time of the newest frame since start; wraps", |s| wrapped((s.time_s * 1000.0) as u64)],
-    [33, "belt_travel", U32, "mm", 10.0, "belt travel since start; wraps after 429 km", |s| s.belt_travel_mm],
+    [0, V1_0, "identity", U16, "", 1.0, "constant 0x4247, \"BG\"", |_| f64::from(0x4247)],
+    [1, V1_0, "map_version", U16, "", 1.0, "major in the high byte, minor in the low", |_| f64::from(MAP_VERSION)],
+    [2, V1_0, "test_u32", U32, "", 1.0, "constant 0x12345678: checks the word order", |_| f64::from(0x1234_5678)],
+    [4, V1_0, "test_i16", I16, "", 1.0, "constant -12345: checks the sign", |_| -12345.0],
+    [10, V1_0, "heartbeat", U16, "", 1.0, "rises ten times a second while frames arrive; wraps", |s| f64::from(s.heartbeat)],
+    [11, V1_0, "status", U16, "bits", 1.0, "bit 0 running, bit 1 ready (belt learned), bit 2 belt motion measured, bit 3 by the encoder, bit 4 stopped by command, bit 5 PLC silent, bit 6 parcels wait to be acknowledged", |s| f64::from(s.status_bits())],
+    [12, V1_0, "fault", U16, "bits", 1.0, "bit 0 frame source ended, bit 1 a table has been full since start (see counters), bit 2 a parcel was never acknowledged, bit 3 CAN bus off or down, bit 4 encoder silent", |s| f64::from(s.fault_bits())],
+    [13, V1_0, "belt_speed", U32, "mm/s", 10.0, "belt speed", |s| s.vision.belt_speed_mm_per_s],
+    [15, V1_0, "frames", U32, "", 1.0, "frames processed; wraps", |s| wrapped(s.vision.counters.frames)],
+    [17, V1_0, "frames_dropped", U32, "", 1.0, "frames that came too late; wraps", |s| wrapped(s.vision.frames_dropped)],
+    [19, V1_0, "parcels", U32, "", 1.0, "sequence number of the latest parcel", |s| f64::from(s.sequence)],
+    [21, V1_0, "parcels_unmeasured", U32, "", 1.0, "parcels that left without a size", |s| wrapped(s.vision.counters.unmeasured)],
+    [23, V1_0, "parcels_lost", U32, "", 1.0, "parcels that vanished inside the view", |s| wrapped(s.vision.counters.lost)],
+    [25, V1_0, "segment_overflows", U32, "", 1.0, "frames with more runs or blobs than the tables hold", |s| wrapped(s.vision.counters.segment_overflows)],
+    [27, V1_0, "track_overflows", U32, "", 1.0, "blobs that found no free track", |s| wrapped(s.vision.counters.track_overflows)],
+    [29, V1_0, "event_overflows", U32, "", 1.0, "records that found the queue to the PLC full", |s| wrapped(s.vision.counters.event_overflows)],
+    [31, V1_0, "time", U32, "ms", 1.0, "time of the newest frame since start; wraps", |s| wrapped((s.vision.time_s * 1000.0) as u64)],
+    [33, V1_0, "belt_travel", U32, "mm", 10.0, "belt travel since start; wraps after 429 km", |s| s.vision.belt_travel_mm],
+    [35, V1_1, "reason", U16, "", 1.0, "what matters most, see below", |s| f64::from(s.reason())],
+    [36, V1_1, "boots", U16, "", 1.0, "starts of the appliance, 0 when plc.state_file is not set; wraps", |s| f64::from(s.boots)],
+    [37, V1_1, "queued", U16, "", 1.0, "parcels that wait to be acknowledged", |s| f64::from(s.queued)],
+    [38, V1_1, "queue_overflows", U32, "", 1.0, "parcels that left the queue without having been acknowledged; wraps", |s| wrapped(s.queue_overflows)],
+    [40, V1_1, "ticket_done", U16, "", 1.0, "ticket of the last command", |s| f64::from(s.ticket)],
+    [41, V1_1, "result", U16, "", 1.0, "what became of it, see below", |s| f64::from(s.outcome)],
+    [42, V1_1, "scale_interval", U16, "mm", 10.0, "dimensions are rounded to multiples of it", |s| s.scale_interval_mm],
+    [43, V1_1, "can_state", U16, "", 1.0, "0 not configured, 1 active, 2 error passive, 3 bus off, 4 down", |s| f64::from(s.can.state as u8)],
+    [44, V1_1, "can_transmit_errors", U16, "", 1.0, "error counter of the controller, when it last told", |s| f64::from(s.can.transmit_errors)],
+    [45, V1_1, "can_receive_errors", U16, "", 1.0, "error counter of the controller, when it last told", |s| f64::from(s.can.receive_errors)],
+    [46, V1_1, "can_bus_offs", U32, "", 1.0, "how often the bus was lost; wraps", |s| wrapped(s.can.bus_offs)],
+    [48, V1_1, "can_parcels_dropped", U32, "", 1.0, "parcels that could not be sent in time; wraps", |s| wrapped(s.can.parcels_dropped)],
+];
+
+/// What a PLC writes, from [`COMMAND`] on.
+#[rustfmt::skip]
+pub const COMMAND_FIELDS: &[CommandField] = fields![
+    [0, V1_1, "plc_heartbeat", U16, "", 1.0, "any value that keeps changing while the PLC is alive", |c| f64::from(c.heartbeat)],
+    [1, V1_1, "acknowledge", U16, "", 1.0, "low word of the sequence number up to which parcels were taken; writing it again does no harm", |c| f64::from(c.acknowledge)],
+    [2, V1_1, "encoder_count", U32, "", 1.0, "belt position as the encoder counts it, as often as possible; wraps at encoder.bits", |c| f64::from(c.encoder_count)],
+    [4, V1_1, "ticket", U16, "", 1.0, "the command is carried out when this is written with another value than before; never 0", |c| f64::from(c.ticket)],
+    [5, V1_1, "command", U16, "", 1.0, "code, see below", |c| f64::from(c.command)],
+    [6, V1_1, "argument", U32, "", 1.0, "of the command", |c| f64::from(c.argument)],
 ];
 
 /// Quality 0 to 100 of a dimension: 100 at sigma 0, 0 from 5 mm on.
@@ -126,53 +268,72 @@ fn quality(sigma_mm: f64) -> f64 {
 /// One parcel, at the latest address and in each block of the ring.
 #[rustfmt::skip]
 pub const PARCEL_FIELDS: &[ParcelField] = fields![
-    [0, "sequence", U32, "", 1.0, "from 1; 0 = no parcel yet", |p| f64::from(p.seq)],
-    [2, "valid", U16, "bits", 1.0, "bit 0 the block holds a parcel, bit 1 its shape is a box (else: no cuboid, its height cannot be trusted)", |p| f64::from(1 | u16::from(p.shape == Shape::Box) << 1)],
-    [3, "flags", U16, "bits", 1.0, "doubts, see below", |p| f64::from(p.flags.bits())],
-    [4, "length", U16, "mm", 10.0, "longer side of the footprint", |p| p.length_mm],
-    [5, "width", U16, "mm", 10.0, "shorter side of the footprint", |p| p.width_mm],
-    [6, "height", U16, "mm", 10.0, "height over the belt", |p| p.height_mm],
-    [7, "yaw", I16, "deg", 100.0, "length axis against travel, counter-clockwise, (-90, 90]", |p| p.yaw_deg],
-    [8, "x", I32, "mm", 10.0, "footprint centre along travel, at time", |p| p.x_mm],
-    [10, "y", I32, "mm", 10.0, "footprint centre across, left positive", |p| p.y_mm],
-    [12, "sigma_length", U16, "mm", 100.0, "standard deviation", |p| p.sigma_length_mm],
-    [13, "sigma_width", U16, "mm", 100.0, "standard deviation", |p| p.sigma_width_mm],
-    [14, "sigma_height", U16, "mm", 100.0, "standard deviation", |p| p.sigma_height_mm],
-    [15, "quality_length", U16, "%", 1.0, "100 - 20 sigma/mm, at least 0", |p| quality(p.sigma_length_mm)],
-    [16, "quality_width", U16, "%", 1.0, "100 - 20 sigma/mm, at least 0", |p| quality(p.sigma_width_mm)],
-    [17, "quality_height", U16, "%", 1.0, "100 - 20 sigma/mm, at least 0", |p| quality(p.sigma_height_mm)],
-    [18, "belt_speed", U32, "mm/s", 10.0, "mean over the pass", |p| p.belt_speed_mm_per_s],
-    [20, "frame", U32, "", 1.0, "frame at which x and y hold; wraps", |p| wrapped(p.frame)],
-    [22, "time", U32, "ms", 1.0, "time of that frame since start; wraps", |p| wrapped((p.t_s * 1000.0).round() as u64)],
-    [24, "belt_travel", U32, "mm", 10.0, "belt travel since start at that frame", |p| p.belt_travel_mm],
-    [30, "sequence_end", U32, "", 1.0, "equals sequence unless the block changed between two requests", |p| f64::from(p.seq)],
+    [0, V1_0, "sequence", U32, "", 1.0, "from 1; 0 = no parcel yet", |p| f64::from(p.seq)],
+    [2, V1_0, "valid", U16, "bits", 1.0, "bit 0 the block holds a parcel, bit 1 its shape is a box (else: no cuboid, its height cannot be trusted), bit 2 the encoder told the belt's motion", |p| f64::from(bits([true, p.shape == Shape::Box, p.by_encoder]))],
+    [3, V1_0, "flags", U16, "bits", 1.0, "doubts, see below", |p| f64::from(p.flags.bits())],
+    [4, V1_0, "length", U16, "mm", 10.0, "longer side of the footprint, or as plc.order says", |p| p.length_mm],
+    [5, V1_0, "width", U16, "mm", 10.0, "shorter side of the footprint, or as plc.order says", |p| p.width_mm],
+    [6, V1_0, "height", U16, "mm", 10.0, "height over the belt, or as plc.order says", |p| p.height_mm],
+    [7, V1_0, "yaw", I16, "deg", 100.0, "length axis against travel, counter-clockwise, (-90, 90]", |p| p.yaw_deg],
+    [8, V1_0, "x", I32, "mm", 10.0, "footprint centre along travel, at time", |p| p.x_mm],
+    [10, V1_0, "y", I32, "mm", 10.0, "footprint centre across, left positive", |p| p.y_mm],
+    [12, V1_0, "sigma_length", U16, "mm", 100.0, "standard deviation", |p| p.sigma_length_mm],
+    [13, V1_0, "sigma_width", U16, "mm", 100.0, "standard deviation", |p| p.sigma_width_mm],
+    [14, V1_0, "sigma_height", U16, "mm", 100.0, "standard deviation", |p| p.sigma_height_mm],
+    [15, V1_0, "quality_length", U16, "%", 1.0, "100 - 20 sigma/mm, at least 0", |p| quality(p.sigma_length_mm)],
+    [16, V1_0, "quality_width", U16, "%", 1.0, "100 - 20 sigma/mm, at least 0", |p| quality(p.sigma_width_mm)],
+    [17, V1_0, "quality_height", U16, "%", 1.0, "100 - 20 sigma/mm, at least 0", |p| quality(p.sigma_height_mm)],
+    [18, V1_0, "belt_speed", U32, "mm/s", 10.0, "mean over the pass", |p| p.belt_speed_mm_per_s],
+    [20, V1_0, "frame", U32, "", 1.0, "frame at which x and y hold; wraps", |p| wrapped(p.frame)],
+    [22, V1_0, "time", U32, "ms", 1.0, "time of that frame since start; wraps", |p| wrapped((p.t_s * 1000.0).round() as u64)],
+    [24, V1_0, "belt_travel", U32, "mm", 10.0, "belt travel since start at that frame", |p| p.belt_travel_mm],
+    [30, V1_0, "sequence_end", U32, "", 1.0, "equals sequence unless the block changed between two requests", |p| f64::from(p.seq)],
 ];
 
 /// All registers, ready to be read.
 pub struct RegisterImage {
+    order: WordOrder,
     registers: [u16; COUNT as usize],
 }
 
-impl Default for RegisterImage {
-    fn default() -> Self {
-        let mut image = Self { registers: [0; COUNT as usize] };
+impl RegisterImage {
+    /// No parcel yet.
+    pub fn new(order: WordOrder) -> Self {
+        let mut image = Self { order, registers: [0; COUNT as usize] };
         image.set_status(&Status::default());
         image
     }
-}
 
-impl RegisterImage {
     /// Write the status block.
     pub fn set_status(&mut self, status: &Status) {
-        write_fields(STATUS_FIELDS, status, &mut self.registers);
+        self.write(STATUS_FIELDS, status, 0);
+    }
+
+    /// Show what the PLC wrote.
+    pub fn set_command(&mut self, block: &CommandBlock) {
+        self.write(COMMAND_FIELDS, block, COMMAND);
     }
 
     /// Write a parcel as the latest and into its place of the ring.
     pub fn publish(&mut self, record: &ParcelRecord) {
-        let slot = record.seq.saturating_sub(1) % u32::from(RING_PARCELS);
-        let ring = RING + slot as u16 * PARCEL_STRIDE;
-        for start in [LATEST, ring] {
-            write_fields(PARCEL_FIELDS, record, &mut self.registers[usize::from(start)..]);
+        let slot = record.seq.wrapping_sub(1) % u32::from(RING_PARCELS);
+        for start in [LATEST, RING + slot as u16 * PARCEL_STRIDE] {
+            self.write(PARCEL_FIELDS, record, start);
+        }
+    }
+
+    /// Write the parcel that waits to be acknowledged, or that there is none.
+    pub fn set_queue_head(&mut self, record: Option<&ParcelRecord>) {
+        match record {
+            Some(record) => self.write(PARCEL_FIELDS, record, QUEUE_HEAD),
+            None => self.registers[usize::from(QUEUE_HEAD)..][..usize::from(PARCEL_STRIDE)].fill(0),
+        }
+    }
+
+    fn write<S>(&mut self, fields: &[Field<S>], source: &S, start: u16) {
+        let block = &mut self.registers[usize::from(start)..];
+        for field in fields {
+            field.write(source, self.order, block);
         }
     }
 
@@ -183,133 +344,33 @@ impl RegisterImage {
     }
 }
 
-fn write_fields<S>(fields: &[Field<S>], source: &S, block: &mut [u16]) {
-    for field in fields {
-        let value = (field.value)(source) * field.scale;
-        let at = usize::from(field.offset);
-        // `as` saturates: out of range shows as the end of the range, NaN as 0.
-        let words = match field.kind {
-            Type::U16 => [value.round() as u16, 0],
-            Type::I16 => [value.round() as i16 as u16, 0],
-            Type::U32 => split(value.round() as u32),
-            Type::I32 => split(value.round() as i32 as u32),
-        };
-        let size = field.kind.registers();
-        block[at..at + size].copy_from_slice(&words[..size]);
-    }
-}
-
-fn split(value: u32) -> [u16; 2] {
-    [(value >> 16) as u16, value as u16]
-}
-
-impl Type {
-    fn registers(self) -> usize {
-        match self {
-            Self::U16 | Self::I16 => 1,
-            Self::U32 | Self::I32 => 2,
-        }
-    }
-}
-
-/// The map as a Markdown document.
-pub fn document() -> String {
-    let mut text = String::from(
-        "# Beltgauge register map\n\n\
-         Printed from the table in `src/plc/registers.rs`; a test fails when they differ.\n\n",
-    );
-    let _ = writeln!(
-        text,
-        "Map version {}.{}. Modbus TCP, any unit identifier. Function codes 3 (holding) and 4 (input)\n\
-         read the same {COUNT} registers, at most 125 at once; every write is refused with exception 1.\n\
-         Addresses start at 0: decimal address 100 is 0x0064, holding register 40101 in the old notation.\n\
-         Two-register values have the high word first. Value = register / scale, in the unit given; what\n\
-         does not fit shows the end of the range. Addresses not listed read 0; beyond the map: exception 2.\n\
-         Poll as fast as you like (10 to 50 ms is usual); a client silent for a minute is disconnected\n\
-         (`modbus.idle_timeout_s`). A restart clears everything: sequence, ring, time and travel begin anew.\n",
-        MAP_VERSION >> 8,
-        MAP_VERSION & 0xff,
-    );
-    text.push_str("## Status, from address 0\n\n");
-    table(&mut text, STATUS_FIELDS, 0);
-    let _ = writeln!(
-        text,
-        "\n## Latest parcel, from address {LATEST}; ring of the last {RING_PARCELS}, from address {RING}\n\n\
-         A parcel takes {PARCEL_STRIDE} registers. Parcel `n` is at {RING} + {PARCEL_STRIDE} * ((n - 1) mod {RING_PARCELS}).\n\
-         A block read in one request is never torn; read in several, it is whole when `sequence` and\n\
-         `sequence_end` are equal. A parcel without a size gets no sequence number; `parcels_unmeasured`\n\
-         counts it. Where a parcel is now: x + status `belt_travel` - its own `belt_travel`.\n\
-         Addresses below are of the latest parcel.\n"
-    );
-    table(&mut text, PARCEL_FIELDS, LATEST);
-    text.push_str("\n## Flags of a parcel\n\n| bit | flag | meaning |\n|---|---|---|\n");
-    for (flag, name, meaning) in Flags::ALL {
-        let _ = writeln!(text, "| {} | {name} | {meaning} |", flag.bits().trailing_zeros());
-    }
-    text
-}
-
-fn table<S>(text: &mut String, fields: &[Field<S>], base: u16) {
-    text.push_str("| address | hex | 4xxxx | name | type | unit | scale | meaning |\n|---|---|---|---|---|---|---|---|\n");
-    for f in fields {
-        let at = base + f.offset;
-        let _ = writeln!(
-            text,
-            "| {at} | 0x{at:04X} | {} | {} | {:?} | {} | {} | {} |",
-            40001 + u32::from(at),
-            f.name,
-            f.kind,
-            f.unit,
-            f.scale,
-            f.meaning
-        );
-    }
-}
-
 #[cfg(test)]
 mod tests {
     use super::*;
-
-    fn record(seq: u32) -> ParcelRecord {
-        ParcelRecord {
-            seq,
-            frame: 137,
-            t_s: 3.425,
-            length_mm: 235.14,
-            width_mm: 124.8,
-            height_mm: 70.2,
-            yaw_deg: -12.4,
-            x_mm: 61.0,
-            y_mm: -40.3,
-            sigma_length_mm: 0.3,
-            sigma_width_mm: 0.25,
-            sigma_height_mm: 7.5,
-            belt_speed_mm_per_s: 500.3,
-            shape: Shape::Box,
-            flags: Flags::default(),
-            belt_travel_mm: 1712.5,
-        }
-    }
+    use crate::plc::record;
 
     fn fields_fit<S>(fields: &[Field<S>], end: u16) {
         let mut next = 0;
         for f in fields {
             assert!(f.offset >= next, "{} overlaps the field before it", f.name);
-            next = f.offset + f.kind.registers() as u16;
+            next = f.offset + f.kind.registers();
         }
         assert!(next <= end);
     }
 
     #[test]
     fn fields_do_not_overlap_and_blocks_hold_them() {
-        fields_fit(STATUS_FIELDS, LATEST);
+        fields_fit(STATUS_FIELDS, COMMAND);
+        fields_fit(COMMAND_FIELDS, COMMAND_COUNT);
         fields_fit(PARCEL_FIELDS, PARCEL_STRIDE);
-        const { assert!(LATEST + PARCEL_STRIDE <= RING) }
+        const { assert!(COMMAND + COMMAND_COUNT <= LATEST) }
+        const { assert!(LATEST + PARCEL_STRIDE <= QUEUE_HEAD) }
+        const { assert!(QUEUE_HEAD + PARCEL_STRIDE <= RING) }
     }
 
     #[test]
     fn a_parcel_is_encoded_as_the_map_says() {
-        let mut image = RegisterImage::default();
+        let mut image = RegisterImage::new(WordOrder::HighFirst);
         image.publish(&record(70_000));
         let latest = image.read(LATEST, PARCEL_STRIDE).expect("exists");
         assert_eq!(latest[..8], [1, 4464, 3, 0, 2351, 1248, 702, (-1240i16) as u16]);
@@ -321,7 +382,7 @@ mod tests {
 
     #[test]
     fn the_ring_keeps_the_last_32_in_their_places() {
-        let mut image = RegisterImage::default();
+        let mut image = RegisterImage::new(WordOrder::HighFirst);
         (1..=40).for_each(|seq| image.publish(&record(seq)));
         for seq in 9..=40u16 {
             let at = RING + (seq - 1) % RING_PARCELS * PARCEL_STRIDE;
@@ -331,7 +392,7 @@ mod tests {
 
     #[test]
     fn values_out_of_range_saturate() {
-        let mut image = RegisterImage::default();
+        let mut image = RegisterImage::new(WordOrder::HighFirst);
         let huge =
             ParcelRecord { length_mm: 1e9, width_mm: -3.0, height_mm: f64::NAN, ..record(1) };
         image.publish(&huge);
@@ -340,7 +401,7 @@ mod tests {
 
     #[test]
     fn registers_beyond_the_map_do_not_exist() {
-        let image = RegisterImage::default();
+        let image = RegisterImage::new(WordOrder::HighFirst);
         assert!(image.read(COUNT - 1, 1).is_some());
         for (address, count) in [(COUNT, 1), (COUNT - 1, 2), (65535, 1), (65535, 65535)] {
             assert!(image.read(address, count).is_none());

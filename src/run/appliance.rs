@@ -1,23 +1,29 @@
 //! The appliance: capture, vision and PLC threads, with rings between them.
 //!
 //! ```text
-//! source -> [ready ring] -> pipeline -> [records] -> Modbus registers
-//!    ^------ [free ring] <-----'           '-------> observer (console, pictures)
+//! source -> [ready ring] -> pipeline -> [records] -> link: Modbus, CAN
+//!    ^------ [free ring] <-----'  ^        '-------> observer (console, pictures)
+//!                                 '--- [counts, requests] --- link
 //! ```
 //! A frame buffer is always in exactly one place. When no buffer is free the frame is dropped
 //! and counted; when a record ring is full the record is counted; vision never waits.
 
 use super::realtime;
+use crate::belt::Encoder;
 use crate::config::{Realtime, Site};
 use crate::error::{Error, Result};
 use crate::event::ParcelRecord;
 use crate::image::{FrameTime, Plane};
 use crate::pipeline::Pipeline;
 use crate::plan::Block;
+use crate::plc::can::CanLink;
+use crate::plc::journal::Journal;
+use crate::plc::link::{Link, Request};
 use crate::plc::modbus;
-use crate::plc::registers::Status;
+use crate::plc::registers::VisionStatus;
 use crate::source::FrameSource;
 use heapless::spsc::{Consumer, Producer, Queue};
+use socketcan::CanFdSocket;
 use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
 use std::sync::{Mutex, OnceLock};
 use std::time::{Duration, Instant};
@@ -26,10 +32,14 @@ use std::time::{Duration, Instant};
 const FRAME_RING: usize = 16;
 /// Records that wait for the PLC thread; at 2 ms a visit it is nearly always empty.
 const RECORD_RING: usize = 64;
+/// Encoder counts on their way to vision, and one: two frames at 1000 counts a second.
+const COUNT_RING: usize = 128;
+/// Requests on their way to vision, and one.
+const REQUEST_RING: usize = 16;
 /// How long a thread sleeps when a ring is empty and nobody has woken it.
 const PARK: Duration = Duration::from_millis(50);
-/// Without a frame for this long the heartbeat stops.
-const SILENCE: Duration = Duration::from_secs(1);
+/// An encoder that moves faster than the belt's nominal speed by this factor was set anew.
+const ENCODER_SPEED_MAX: f64 = 5.0;
 
 /// When frames are taken.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -44,7 +54,7 @@ pub enum Pace {
 #[derive(Clone, Copy, Debug, Default)]
 pub struct Progress {
     /// As the PLC sees it.
-    pub status: Status,
+    pub status: VisionStatus,
     /// The slowest frame so far, in the pipeline alone.
     pub frame_time_max: Duration,
 }
@@ -53,6 +63,8 @@ pub struct Progress {
 struct Frame {
     pixels: Block<u8>,
     time: FrameTime,
+    /// When it was exposed, by the clock that encoder counts are timed by.
+    captured: Instant,
 }
 
 /// The appliance, before it runs.
@@ -60,6 +72,7 @@ pub struct Appliance {
     site: Site,
     pace: Pace,
     listener: std::net::TcpListener,
+    journal: Journal,
 }
 
 /// What the threads share.
@@ -94,10 +107,11 @@ impl Shared {
 }
 
 impl Appliance {
-    /// Bind the PLC's socket; nothing runs yet.
+    /// Bind the PLC's socket, read what a PLC was told before; nothing runs yet.
     pub fn new(site: Site, pace: Pace) -> Result<Self> {
         let listener = modbus::bind(&site.config.modbus)?;
-        Ok(Self { site, pace, listener })
+        let journal = site.config.plc.state_file.as_deref().map(Journal::open).transpose()?;
+        Ok(Self { site, pace, listener, journal: journal.unwrap_or_default() })
     }
 
     /// Run until the source ends or `observe` returns false. `observe` is called a few times a
@@ -108,16 +122,25 @@ impl Appliance {
         mut observe: impl FnMut(&Progress, &mut dyn Iterator<Item = ParcelRecord>) -> bool,
     ) -> Result<Progress> {
         self.site.check_image_size(source.size_px())?;
-        let modbus_settings = self.site.config.modbus.clone();
-        let (pace, listener) = (self.pace, self.listener);
-        let realtime = self.site.config.realtime.clone();
+        let config = self.site.config.clone();
+        let (pace, listener, journal) = (self.pace, self.listener, self.journal);
+        let encoder = config.encoder.mm_per_count.map(|mm| {
+            let speed_max_mm_per_s = ENCODER_SPEED_MAX * config.belt.speed_mm_per_s;
+            Encoder::new(mm, config.encoder.bits, config.encoder.timeout_s, speed_max_mm_per_s)
+        });
         let (buffers, pipeline) = super::memory::build(self.site)?;
-        realtime::lock_memory(&realtime)?;
+        realtime::lock_memory(&config.realtime)?;
         let shared = Shared::default();
         let (mut free, mut ready) =
             (Queue::<Block<u8>, FRAME_RING>::new(), Queue::<Frame, FRAME_RING>::new());
-        let (mut to_plc, mut to_observer) =
-            (Queue::<ParcelRecord, RECORD_RING>::new(), Queue::<ParcelRecord, RECORD_RING>::new());
+        let (mut to_plc, mut to_observer) = (
+            Queue::<(ParcelRecord, f64), RECORD_RING>::new(),
+            Queue::<ParcelRecord, RECORD_RING>::new(),
+        );
+        let (mut counts, mut requests) =
+            (Queue::<(u32, Instant), COUNT_RING>::new(), Queue::<Request, REQUEST_RING>::new());
+        let ((mut count_in, count_out), (mut request_in, request_out)) =
+            (counts.split(), requests.split());
         let ((mut free_in, free_out), (ready_in, ready_out)) = (free.split(), ready.split());
         let ((plc_in, mut plc_out), (observer_in, mut observer_out)) =
             (to_plc.split(), to_observer.split());
@@ -129,22 +152,48 @@ impl Appliance {
             let shared = &shared;
             // However this closure is left, the threads must end, or the scope waits for ever.
             let _stop = StopOnDrop(shared);
-            let records = [plc_in, observer_in];
-            let vision = Vision { pipeline, ready: ready_out, free: free_in, records, shared };
-            let vision = spawn(scope, "vision", move || vision.run_on(&realtime))?;
+            let config = &config;
+            let vision = Vision {
+                pipeline,
+                ready: ready_out,
+                free: free_in,
+                records: (plc_in, observer_in),
+                encoder: encoder.map(|encoder| (encoder, Instant::now())),
+                counts: count_out,
+                requests: request_out,
+                shared,
+            };
+            let vision = spawn(scope, "vision", move || vision.run_on(&config.realtime))?;
             let capture = Capture { source, pace, free: free_out, ready: ready_in, shared };
             let capture = spawn(scope, "capture", move || capture.run())?;
             let plc = spawn(scope, "plc", move || {
-                let mut heartbeat = Heartbeat::new();
-                modbus::serve(listener, &modbus_settings, |publish| {
+                let now = Instant::now();
+                let encoder_timeout = config.encoder.mm_per_count.map(|_| config.encoder.timeout_s);
+                let encoder_timeout = encoder_timeout.map(Duration::from_secs_f64);
+                let mut can = CanLink::<CanFdSocket>::new(config.can.clone(), now);
+                let link = Link::new(config.plc.clone(), config.modbus.word_order, journal, now);
+                modbus::serve(listener, &config.modbus, link, |link| {
                     // Asked before the ring is emptied: what came before the end is published.
                     let ended = shared.vision_ended.load(Ordering::Acquire);
-                    while let Some(record) = plc_out.dequeue() {
-                        publish(&record);
+                    while let Some((record, travel_mm)) = plc_out.dequeue() {
+                        link.record(record, travel_mm);
                     }
-                    let mut status = shared.progress().status;
-                    heartbeat.update(&mut status);
-                    (!ended).then_some(status)
+                    if ended {
+                        link.flush();
+                    }
+                    let now = Instant::now();
+                    link.update(&shared.progress().status, &can.status(), encoder_timeout, now);
+                    can.step(link, now);
+                    // A ring that is full has enough of them: vision has not looked for long.
+                    while let Some(count) = link.next_count() {
+                        let _ = count_in.enqueue(count);
+                    }
+                    while request_in.ready()
+                        && let Some(request) = link.next_request()
+                    {
+                        let _ = request_in.enqueue(request);
+                    }
+                    !ended
                 })
             })?;
             while !(capture.is_finished() || vision.is_finished() || plc.is_finished()) {
@@ -227,10 +276,12 @@ impl Capture<'_> {
                 }
                 continue;
             };
+            let due = start + Duration::from_secs_f64(taken as f64 * period_s);
             let Some(time) = self.source.next_into(&mut pixels)? else { return Ok(()) };
+            let captured = if self.pace == Pace::RealTime { due } else { Instant::now() };
             taken += 1;
             // There are no more frames than places in the ring.
-            let _ = self.ready.enqueue(Frame { pixels, time });
+            let _ = self.ready.enqueue(Frame { pixels, time, captured });
             self.shared.wake_vision();
         }
         Ok(())
@@ -262,7 +313,12 @@ struct Vision<'a> {
     pipeline: Pipeline,
     ready: Consumer<'a, Frame>,
     free: Producer<'a, Block<u8>>,
-    records: [Producer<'a, ParcelRecord>; 2],
+    /// To the PLC, each with the belt's travel; and to the observer.
+    records: (Producer<'a, (ParcelRecord, f64)>, Producer<'a, ParcelRecord>),
+    /// With the instant that its time counts from.
+    encoder: Option<(Encoder, Instant)>,
+    counts: Consumer<'a, (u32, Instant)>,
+    requests: Consumer<'a, Request>,
     shared: &'a Shared,
 }
 
@@ -301,17 +357,45 @@ impl Vision<'_> {
                 continue;
             };
             let began = Instant::now();
+            self.obey();
+            self.read_encoder(frame.captured);
             let raw = Plane::packed(&frame.pixels, width, height)
                 .ok_or_else(|| Error::failure("a frame of another size"))?;
-            let records = &mut self.records;
+            let mut left = heapless::Vec::<ParcelRecord, RECORD_RING>::new();
             self.pipeline.step(raw, frame.time, &mut |record| {
-                let [plc, observer] = records;
-                overflows += u64::from(plc.enqueue(record).is_err());
+                overflows += u64::from(left.push(record).is_err());
+            })?;
+            let travel_mm = self.pipeline.belt_position().travel_mm;
+            let (plc, observer) = &mut self.records;
+            for record in left {
+                overflows += u64::from(plc.enqueue((record, travel_mm)).is_err());
                 // An observer that does not look misses records; the PLC never does.
                 let _ = observer.enqueue(record);
-            })?;
+            }
             self.publish(frame.time.t_s, began.elapsed(), overflows);
             let _ = self.free.enqueue(frame.pixels);
+        }
+    }
+
+    /// Do what the PLC asked for.
+    fn obey(&mut self) {
+        while let Some(request) = self.requests.dequeue() {
+            match request {
+                Request::Learn => self.pipeline.learn(),
+                Request::Report(reporting) => self.pipeline.report_parcels(reporting),
+            }
+        }
+    }
+
+    /// Tell the pipeline where the belt was when a frame was exposed.
+    fn read_encoder(&mut self, captured: Instant) {
+        let Some((encoder, start)) = &mut self.encoder else { return };
+        let seconds = |at: Instant| at.saturating_duration_since(*start).as_secs_f64();
+        while let Some((count, at)) = self.counts.dequeue() {
+            encoder.count(count, seconds(at));
+        }
+        if let Some(position_mm) = encoder.position_mm(seconds(captured)) {
+            self.pipeline.encoder(position_mm);
         }
     }
 
@@ -324,37 +408,10 @@ impl Vision<'_> {
         status.counters.event_overflows = overflows;
         status.ready = self.pipeline.ready();
         status.belt_speed_mm_per_s = speed.max(0.0);
-        status.belt_measured = measured;
+        status.by_encoder = self.pipeline.by_encoder();
+        status.belt_measured = measured || status.by_encoder;
         status.belt_travel_mm = self.pipeline.belt_position().travel_mm;
         status.time_s = time_s;
         progress.frame_time_max = progress.frame_time_max.max(frame_time);
-    }
-}
-
-/// Rises ten times a second while frames arrive.
-struct Heartbeat {
-    start: Instant,
-    frames: u64,
-    last_frame: Instant,
-    beat: u16,
-}
-
-impl Heartbeat {
-    fn new() -> Self {
-        let now = Instant::now();
-        Self { start: now, frames: 0, last_frame: now, beat: 0 }
-    }
-
-    fn update(&mut self, status: &mut Status) {
-        let now = Instant::now();
-        if status.counters.frames != self.frames {
-            self.frames = status.counters.frames;
-            self.last_frame = now;
-        }
-        status.running = self.frames > 0 && now - self.last_frame < SILENCE && !status.source_ended;
-        if status.running {
-            self.beat = ((now - self.start).as_millis() / 100) as u16;
-        }
-        status.heartbeat = self.beat;
     }
 }

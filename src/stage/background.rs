@@ -239,6 +239,15 @@ impl Background {
         gain.clamp(u64::from(GAIN_ONE / 4), 65535) as u32
     }
 
+    /// Learn anew, from the next frame on.
+    pub fn forget(&mut self) {
+        self.variance.fill(VARIANCE_NEW);
+        for block in [&mut self.multiple, &mut self.foreground, &mut self.dark, &mut self.strong] {
+            block.fill(0);
+        }
+        (self.gain_q15, self.frames) = (GAIN_ONE, 0);
+    }
+
     /// Whether the model has seen enough frames to be trusted.
     pub fn learned(&self) -> bool {
         self.frames > self.settings.learn_frames

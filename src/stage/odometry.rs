@@ -186,6 +186,11 @@ impl Odometry {
         Motion { step_mm, measured: self.locked }
     }
 
+    /// The next frame follows no other: as at start, but for the speed.
+    pub fn forget(&mut self) {
+        (self.shift_px, self.locked, self.misses) = (None, false, 0);
+    }
+
     /// Speed of the belt, mm/s, and whether it is measured rather than assumed.
     pub fn speed(&self) -> (f64, bool) {
         (self.speed_mm_per_s, self.locked)

@@ -388,6 +388,12 @@ impl Tracker {
         &self.changes
     }
 
+    /// Follow nothing any more.
+    pub fn forget(&mut self) {
+        self.tracks.fill(FREE);
+        self.changes.clear();
+    }
+
     /// A riding parcel was reported.
     pub fn set_left(&mut self, slot: usize) {
         self.tracks[slot].phase = Phase::Left;
