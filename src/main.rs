@@ -40,6 +40,9 @@ enum Command {
         /// Address and port of the Modbus server [default: 0.0.0.0:1502].
         #[arg(long)]
         listen: Option<SocketAddr>,
+        /// File with tables of a configuration that replace the demo's own, for example [can].
+        #[arg(long)]
+        config: Option<PathBuf>,
     },
     /// Measure a recording, as fast as it goes.
     Measure {
@@ -242,8 +245,9 @@ impl Observer for Console {
 
 fn dispatch(command: Command) -> Result<()> {
     match command {
-        Command::Demo { seconds, out, listen } => {
-            let table = demo::run(demo::Options { seconds, out: &out, listen })?;
+        Command::Demo { seconds, out, listen, config } => {
+            let config = config.as_deref();
+            let table = demo::run(demo::Options { seconds, out: &out, listen, config })?;
             print(format_args!("{table}\npictures and records are in {}", out.display()))
         }
         Command::Measure { input, config, fps, jsonl, annotate } => {

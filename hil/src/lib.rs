@@ -2,7 +2,9 @@
 //! write. Here is what its tests share; the tests are in `hil/tests`.
 
 pub mod opencv_chain;
+pub mod plc;
 pub mod scene;
+pub mod server;
 
 use std::net::{SocketAddr, TcpListener, TcpStream};
 use std::path::{Path, PathBuf};

@@ -38,7 +38,17 @@ impl Site {
         let config = Config::parse(&text).map_err(|e| e.in_file(path))?;
         let folder = path.parent().unwrap_or(Path::new("."));
         let camera = CameraFile::load(&folder.join(&config.camera.calibration))?;
-        Self::new(config, camera).map_err(|e| e.in_file(path))
+        let mut site = Self::new(config, camera).map_err(|e| e.in_file(path))?;
+        site.beside(path);
+        Ok(site)
+    }
+
+    /// Files that the configuration names are beside it.
+    pub fn beside(&mut self, path: &Path) {
+        let folder = path.parent().unwrap_or(Path::new("."));
+        if let Some(file) = &mut self.config.plc.state_file {
+            *file = folder.join(&*file);
+        }
     }
 
     /// Check the configuration against the camera.

@@ -29,6 +29,8 @@ pub struct Options<'a> {
     pub out: &'a Path,
     /// Where the Modbus server listens; default: the demo configuration's port 1502.
     pub listen: Option<SocketAddr>,
+    /// File with other tables of a configuration, for example `[can]`.
+    pub config: Option<&'a Path>,
 }
 
 /// The demo's scenario.
@@ -41,6 +43,22 @@ pub fn site(scenario: &Scenario) -> Result<Site> {
     Site::new(Config::parse(CONFIG)?, scenario.camera()?)
 }
 
+/// The same with the tables of a file in place of the demo's own.
+fn site_with(scenario: &Scenario, path: &Path) -> Result<Site> {
+    let unreadable = |e: &dyn std::fmt::Display| {
+        Error::configuration(format!("cannot read the tables: {e}"))
+            .in_file(path)
+            .remedy("give a file with tables of config/reference.toml")
+    };
+    let table = |text: &str| text.parse::<toml::Table>().map_err(|e| unreadable(&e));
+    let mut tables = table(CONFIG)?;
+    tables.extend(table(&std::fs::read_to_string(path).map_err(|e| unreadable(&e))?)?);
+    let config = Config::parse(&tables.to_string()).map_err(|e| e.in_file(path))?;
+    let mut site = Site::new(config, scenario.camera()?).map_err(|e| e.in_file(path))?;
+    site.beside(path);
+    Ok(site)
+}
+
 /// Run the demo; returns the table of measured against true sizes.
 pub fn run(options: Options<'_>) -> Result<String> {
     if !(1.0..=3000.0).contains(&options.seconds) {
@@ -49,7 +67,10 @@ pub fn run(options: Options<'_>) -> Result<String> {
         );
     }
     let scenario = scenario()?;
-    let mut site = site(&scenario)?;
+    let mut site = match options.config {
+        Some(path) => site_with(&scenario, path)?,
+        None => site(&scenario)?,
+    };
     if let Some(listen) = options.listen {
         site.config.modbus.listen = listen;
     }

@@ -1,0 +1,104 @@
+//! The appliance's Modbus server and link without camera and vision, fed with parcels by a test.
+
+use beltgauge::config::{Modbus, Plc as Settings};
+use beltgauge::event::{Flags, ParcelRecord, Shape};
+use beltgauge::plc::journal::Journal;
+use beltgauge::plc::link::Link;
+use beltgauge::plc::modbus;
+use beltgauge::plc::registers::{CanStatus, VisionStatus};
+use std::net::SocketAddr;
+use std::path::Path;
+use std::sync::atomic::{AtomicBool, AtomicU32, Ordering};
+use std::sync::{Arc, mpsc};
+use std::thread::JoinHandle;
+use std::time::Instant;
+
+/// A running server; dropped, it ends at once, as a killed appliance does.
+pub struct Server {
+    /// Where it listens.
+    pub address: SocketAddr,
+    parcels: mpsc::Sender<ParcelRecord>,
+    stop: Arc<AtomicBool>,
+    published: Arc<AtomicU32>,
+    thread: Option<JoinHandle<()>>,
+}
+
+impl Server {
+    /// Start it, with a queue; `state` is its file over restarts.
+    ///
+    /// # Panics
+    /// When it cannot be started.
+    pub fn start(listen: SocketAddr, state: Option<&Path>) -> Self {
+        let settings = Modbus { listen, ..Modbus::default() };
+        let listener = modbus::bind(&settings).expect("a free port");
+        let address = listener.local_addr().expect("bound");
+        let journal = state.map(|path| Journal::open(path).expect("writable")).unwrap_or_default();
+        let (parcels, incoming) = mpsc::channel::<ParcelRecord>();
+        let (stop, published) = (Arc::<AtomicBool>::default(), Arc::<AtomicU32>::default());
+        let (stopped, shown) = (Arc::clone(&stop), Arc::clone(&published));
+        let thread = std::thread::spawn(move || {
+            let plc = Settings { queue: true, ..Settings::default() };
+            let link = Link::new(plc, settings.word_order, journal, Instant::now());
+            let mut vision = VisionStatus { ready: true, ..VisionStatus::default() };
+            let served = modbus::serve(listener, &settings, link, |link| {
+                vision.counters.frames += 1;
+                while let Ok(record) = incoming.try_recv() {
+                    link.record(record, 0.0);
+                }
+                link.update(&vision, &CanStatus::default(), None, Instant::now());
+                while link.next_count().is_some() {}
+                while link.next_request().is_some() {}
+                shown.store(link.status().sequence, Ordering::Release);
+                !stopped.load(Ordering::Relaxed)
+            });
+            served.expect("serves");
+        });
+        Self { address, parcels, stop, published, thread: Some(thread) }
+    }
+
+    /// A parcel leaves the zone; its size tells its number.
+    ///
+    /// # Panics
+    /// When the server has ended.
+    pub fn parcel(&self, number: u32) {
+        self.parcels.send(record(number)).expect("the server runs");
+    }
+
+    /// Sequence number of the last parcel that registers show.
+    pub fn published(&self) -> u32 {
+        self.published.load(Ordering::Acquire)
+    }
+}
+
+impl Drop for Server {
+    fn drop(&mut self) {
+        self.stop.store(true, Ordering::Relaxed);
+        if let Some(thread) = self.thread.take() {
+            let ended = thread.join();
+            assert!(ended.is_ok() || std::thread::panicking(), "the server panicked");
+        }
+    }
+}
+
+/// A parcel whose length and width tell its number.
+pub fn record(number: u32) -> ParcelRecord {
+    ParcelRecord {
+        seq: number,
+        frame: u64::from(number),
+        t_s: 0.0,
+        length_mm: 100.0 + f64::from(number % 997),
+        width_mm: 50.0 + f64::from(number / 997),
+        height_mm: 80.0,
+        yaw_deg: 0.0,
+        x_mm: 0.0,
+        y_mm: 0.0,
+        sigma_length_mm: 0.3,
+        sigma_width_mm: 0.3,
+        sigma_height_mm: 0.5,
+        belt_speed_mm_per_s: 500.0,
+        shape: Shape::Box,
+        flags: Flags::default(),
+        belt_travel_mm: 0.0,
+        by_encoder: false,
+    }
+}
