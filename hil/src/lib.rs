@@ -1,6 +1,9 @@
 //! Hardware in the loop without hardware: the real binary, and peers that the project did not
 //! write. Here is what its tests share; the tests are in `hil/tests`.
 
+pub mod can_peer;
+pub mod machine;
+#[cfg(feature = "opencv")]
 pub mod opencv_chain;
 pub mod plc;
 pub mod scene;

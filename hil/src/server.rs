@@ -1,11 +1,13 @@
-//! The appliance's Modbus server and link without camera and vision, fed with parcels by a test.
+//! The appliance's link, Modbus server and CAN without camera and vision, fed with parcels by a test.
 
-use beltgauge::config::{Modbus, Plc as Settings};
+use beltgauge::config::{Can, Modbus, Plc as Settings};
 use beltgauge::event::{Flags, ParcelRecord, Shape};
+use beltgauge::plc::can::CanLink;
 use beltgauge::plc::journal::Journal;
 use beltgauge::plc::link::Link;
 use beltgauge::plc::modbus;
-use beltgauge::plc::registers::{CanStatus, VisionStatus};
+use beltgauge::plc::registers::VisionStatus;
+use socketcan::CanFdSocket;
 use std::net::SocketAddr;
 use std::path::Path;
 use std::sync::atomic::{AtomicBool, AtomicU32, Ordering};
@@ -20,6 +22,7 @@ pub struct Server {
     parcels: mpsc::Sender<ParcelRecord>,
     stop: Arc<AtomicBool>,
     published: Arc<AtomicU32>,
+    queued: Arc<AtomicU32>,
     thread: Option<JoinHandle<()>>,
 }
 
@@ -29,31 +32,44 @@ impl Server {
     /// # Panics
     /// When it cannot be started.
     pub fn start(listen: SocketAddr, state: Option<&Path>) -> Self {
+        Self::start_with(listen, state, Can::default())
+    }
+
+    /// The same on a CAN bus too.
+    ///
+    /// # Panics
+    /// When it cannot be started.
+    pub fn start_with(listen: SocketAddr, state: Option<&Path>, can: Can) -> Self {
         let settings = Modbus { listen, ..Modbus::default() };
         let listener = modbus::bind(&settings).expect("a free port");
         let address = listener.local_addr().expect("bound");
         let journal = state.map(|path| Journal::open(path).expect("writable")).unwrap_or_default();
         let (parcels, incoming) = mpsc::channel::<ParcelRecord>();
-        let (stop, published) = (Arc::<AtomicBool>::default(), Arc::<AtomicU32>::default());
-        let (stopped, shown) = (Arc::clone(&stop), Arc::clone(&published));
+        let (published, queued) = (Arc::<AtomicU32>::default(), Arc::<AtomicU32>::default());
+        let (shown, waiting) = (Arc::clone(&published), Arc::clone(&queued));
+        let stop = Arc::<AtomicBool>::default();
+        let stopped = Arc::clone(&stop);
         let thread = std::thread::spawn(move || {
             let plc = Settings { queue: true, ..Settings::default() };
             let link = Link::new(plc, settings.word_order, journal, Instant::now());
+            let mut can = CanLink::<CanFdSocket>::new(can, Instant::now());
             let mut vision = VisionStatus { ready: true, ..VisionStatus::default() };
             let served = modbus::serve(listener, &settings, link, |link| {
                 vision.counters.frames += 1;
                 while let Ok(record) = incoming.try_recv() {
                     link.record(record, 0.0);
                 }
-                link.update(&vision, &CanStatus::default(), None, Instant::now());
+                link.update(&vision, &can.status(), None, Instant::now());
+                can.step(link, Instant::now());
                 while link.next_count().is_some() {}
                 while link.next_request().is_some() {}
+                waiting.store(u32::from(link.status().queued), Ordering::Relaxed);
                 shown.store(link.status().sequence, Ordering::Release);
                 !stopped.load(Ordering::Relaxed)
             });
             served.expect("serves");
         });
-        Self { address, parcels, stop, published, thread: Some(thread) }
+        Self { address, parcels, stop, published, queued, thread: Some(thread) }
     }
 
     /// A parcel leaves the zone; its size tells its number.
@@ -62,6 +78,11 @@ impl Server {
     /// When the server has ended.
     pub fn parcel(&self, number: u32) {
         self.parcels.send(record(number)).expect("the server runs");
+    }
+
+    /// Parcels that wait to be acknowledged.
+    pub fn queued(&self) -> u32 {
+        self.queued.load(Ordering::Relaxed)
     }
 
     /// Sequence number of the last parcel that registers show.

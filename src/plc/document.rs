@@ -1,7 +1,7 @@
 //! The register map as documents: Markdown to read, CSV to import.
 
 use super::frames;
-use super::link::{COMMANDS, Outcome};
+use super::link::{COMMANDS, Outcome, REPEATED};
 use super::registers::{
     COMMAND, COMMAND_COUNT, COMMAND_FIELDS, COUNT, LATEST, MAP_VERSION, PARCEL_FIELDS,
     PARCEL_STRIDE, QUEUE_HEAD, REASONS, RING, RING_PARCELS, STATUS_FIELDS,
@@ -103,6 +103,8 @@ fn can(text: &mut String) {
          Segments: the first byte is the low byte of the sequence number, the second the number of the segment.\n\
          A parcel is whole when segments 0 to {} have come with the same first byte; if the first byte changes\n\
          before, one was lost. `sequence` in segment 0 tells how many parcels are missing; the ring has them.\n\
+         After bus off, a lost interface or a restart the last {REPEATED} parcels are sent again: a sequence number that\n\
+         was there before is a repetition.\n\
          Up to {RING_PARCELS} parcels wait while the bus is off or nobody acknowledges; then the oldest is dropped and\n\
          counted in `can_parcels_dropped`. After bus off the controller must be restarted by its driver:\n\
          `ip link set can0 type can bitrate 500000 restart-ms 100`.",

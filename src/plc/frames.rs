@@ -8,6 +8,7 @@
 
 use super::registers::{PARCEL_FIELDS, STATUS_FIELDS, Status};
 use super::table::Field;
+pub use super::table::Type;
 use crate::event::ParcelRecord;
 use heapless::Vec;
 
@@ -144,6 +145,13 @@ fn encode<S: 'static>(
             payload.extend_from_slice(head.map(|head| [head, segment]).as_slice().as_flattened());
         Frame { message, payload }
     };
+    // Segments are filled up, so that every one is as long as the DBC says.
+    let mut emit = |mut frame: Frame| {
+        if head.is_some() {
+            let _ = frame.payload.resize(CLASSICAL_BYTES, 0); // invariant: has room
+        }
+        emit(frame);
+    };
     let (mut at, mut frame) = (0, begin(0));
     for Place { field, segment, .. } in places {
         if segment != at {
@@ -230,7 +238,7 @@ mod tests {
         for (i, frame) in frames.iter().enumerate() {
             assert_eq!(frame.message, Message::Parcel);
             assert_eq!(frame.payload[..2], [0x45, i as u8]);
-            assert!(frame.payload.len() <= CLASSICAL_BYTES);
+            assert_eq!(frame.payload.len(), CLASSICAL_BYTES);
         }
     }
 

@@ -19,6 +19,9 @@ use std::time::{Duration, Instant};
 const WAITING_MAX: usize = 64;
 /// Parcels that wait to be acknowledged, or to be sent.
 pub const QUEUE_PARCELS: usize = RING_PARCELS as usize;
+/// Parcels that are sent over CAN again after a restart or a disturbance. With CAN FD, where a parcel
+/// is a frame, so many may have been in the kernel's queue of ten and the controller.
+pub(super) const REPEATED: usize = 12;
 /// Encoder counts between two frames.
 const COUNTS_MAX: usize = 64;
 /// Commands between two visits of the vision thread.
@@ -136,8 +139,14 @@ impl Link {
             beats: Beats { start: now, frames: 0, last_frame: now },
         };
         let acknowledged = link.journal.acknowledged();
-        for record in link.journal.records().to_vec() {
+        let known = link.journal.records().to_vec();
+        let sent = known.len().saturating_sub(REPEATED);
+        for (i, record) in known.into_iter().enumerate() {
             link.image.publish(&record);
+            if i >= sent {
+                // The last run may have ended before it had sent them.
+                let _ = link.to_send.push_back(record); // invariant: there is room
+            }
             if link.settings.queue && is_after(record.seq, acknowledged) {
                 let _ = link.queue.push_back(record); // no more than fit were kept
             }
