@@ -8,6 +8,7 @@ mod guard;
 pub mod journal;
 pub mod link;
 pub mod modbus;
+mod present;
 pub mod registers;
 mod table;
 
