@@ -1,6 +1,6 @@
 //! The committed documents of the PLC interface are those of the code.
 
-use beltgauge::plc::{dbc, document};
+use beltgauge::plc::{dbc, document, structured_text};
 
 fn is_current(name: &str, current: &str) {
     let path = format!("{}/config/{name}", env!("CARGO_MANIFEST_DIR"));
@@ -23,4 +23,9 @@ fn the_committed_register_map_is_current() {
 #[test]
 fn the_committed_dbc_is_current() {
     is_current("beltgauge.dbc", &dbc::document(beltgauge::config::Can::default().base_id));
+}
+
+#[test]
+fn the_committed_structured_text_is_current() {
+    is_current("plc.st", &structured_text::document());
 }

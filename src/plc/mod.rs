@@ -10,6 +10,7 @@ pub mod link;
 pub mod modbus;
 mod present;
 pub mod registers;
+pub mod structured_text;
 mod table;
 
 /// A record for tests.
