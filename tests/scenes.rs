@@ -5,6 +5,7 @@ mod common;
 use beltgauge::config::{Config, Site};
 use beltgauge::event::{Flags, ParcelRecord, Shape};
 use beltgauge::image::Plane;
+use beltgauge::pipeline::Pipeline;
 use beltgauge::run;
 use beltgauge::source::FrameSource;
 use beltgauge::source::synthetic::{Parcel, Scenario, Synthetic};
@@ -321,6 +322,48 @@ fn an_encoder_measures_heights_on_a_belt_without_texture_that_stops() {
     let pairs = matched(&scenario, &records);
     assert!(!pairs[0].1.flags.has(Flags::SPEED_ASSUMED), "{:?}", pairs[0].1);
     assert_sizes(&pairs, FOOTPRINT_MM, HEIGHT_MM);
+}
+
+/// Records of a scenario whose pipeline is told something at a frame.
+fn told(scenario: &Scenario, at: u64, tell: impl Fn(&mut Pipeline)) -> Vec<ParcelRecord> {
+    let mut source = Synthetic::new(scenario.clone()).expect("renders");
+    let (mut frames, mut pipeline) = run::build(site(scenario, 490.0)).expect("fits");
+    let mut frame = frames.pop().expect("planned");
+    let [width, height] = source.size_px();
+    let mut records = Vec::new();
+    while let Some(time) = source.next_into(&mut frame).expect("renders") {
+        if time.index == at {
+            tell(&mut pipeline);
+        }
+        let raw = Plane::packed(&frame, width, height).expect("this size");
+        pipeline.step(raw, time, &mut |r| records.push(r)).expect("this size");
+    }
+    records
+}
+
+/// One parcel in the zone at frame 60, another that comes when it has gone, at 150.
+fn two_parcels() -> Scenario {
+    let [first, second] =
+        [-950.0, -3400.0].map(|x| parcel([220.0, 150.0, 90.0], 30.0, [x, 40.0], "kraft"));
+    scenario(310, 500.0, &(first + &second))
+}
+
+#[test]
+fn a_belt_that_is_learned_anew_between_two_parcels_measures_both() {
+    let scenario = two_parcels();
+    // The belt is empty, as the command says it must be.
+    let records = told(&scenario, 125, Pipeline::learn);
+    assert_eq!(records.len(), 2, "{records:?}");
+    assert_sizes(&matched(&scenario, &records), FOOTPRINT_MM, HEIGHT_MM);
+}
+
+#[test]
+fn a_pipeline_that_is_stopped_reports_nothing_until_it_is_started() {
+    let scenario = two_parcels();
+    assert!(told(&scenario, 20, |p| p.report_parcels(false)).is_empty());
+    let first = told(&scenario, 125, |p| p.report_parcels(false));
+    assert_eq!(first.len(), 1, "{first:?}");
+    assert_eq!((first[0].seq, told(&scenario, 0, |p| p.report_parcels(true)).len()), (1, 2));
 }
 
 #[test]

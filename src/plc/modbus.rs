@@ -217,6 +217,27 @@ pub(super) fn identification() -> [(u8, String); 4] {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::config::{Plc, WordOrder};
+    use crate::plc::journal::Journal;
+
+    #[test]
+    fn the_map_begins_at_the_base_address_and_words_come_in_the_order_asked_for() {
+        let mut link =
+            Link::new(Plc::default(), WordOrder::LowFirst, Journal::default(), Instant::now());
+        let mut read =
+            |address, count| answer(&mut link, 1000, Request::ReadHoldingRegisters(address, count));
+        let words = vec![0x4247, MAP_VERSION, 0x5678, 0x1234];
+        assert_eq!(read(1000, 4), Ok(Response::ReadHoldingRegisters(words)));
+        for (address, count) in [(999, 1), (0, 4), (1000 + 1224, 1), (65535, 1)] {
+            assert_eq!(read(address, count), Err(ExceptionCode::IllegalDataAddress));
+        }
+        let count = Request::WriteMultipleRegisters(1062, vec![7, 1].into());
+        assert_eq!(answer(&mut link, 1000, count), Ok(Response::WriteMultipleRegisters(1062, 2)));
+        assert_eq!(link.next_count().map(|(count, _)| count), Some(0x1_0007));
+        let elsewhere = Request::WriteSingleRegister(60, 1);
+        let refused = answer(&mut link, 1000, elsewhere);
+        assert_eq!(refused, Err(ExceptionCode::IllegalDataAddress));
+    }
 
     #[test]
     fn only_clients_on_the_list_are_let_in() {
