@@ -176,6 +176,10 @@ impl<B: Bus> CanLink<B> {
             let Some(bus) = &mut self.bus else { return };
             match bus.receive() {
                 Ok(Event::Frame { id, payload }) => {
+                    if self.status.state == CanState::BusOff {
+                        // Who receives is on the bus, whatever was or was not reported.
+                        self.status.state = CanState::Active;
+                    }
                     match frames::decode(id.wrapping_sub(self.settings.base_id), &payload) {
                         Some(Received::Command(ticket, command, argument)) => {
                             link.command(ticket, command, argument);
@@ -428,6 +432,18 @@ mod tests {
         (0..8).for_each(|_| bench.step());
         assert_eq!(bench.can.status().state, CanState::Active);
         assert_eq!(Bench::received(), [1, 2, 3, 1, 2, 3, 4, 5]);
+    }
+
+    #[test]
+    fn a_frame_that_comes_in_ends_bus_off() {
+        let mut bench = Bench::new();
+        let event = |event| wire(|wire| wire.coming.push_back(event));
+        event(Event::Error { class: 0x40, data: [0; 8] });
+        bench.step();
+        assert_eq!(bench.can.status().state, CanState::BusOff);
+        event(Event::Frame { id: 0x123, payload: Payload::new() });
+        bench.step();
+        assert_eq!(bench.can.status().state, CanState::Active);
     }
 
     #[test]

@@ -158,7 +158,11 @@ impl Link {
 
     /// A parcel has left the zone, the belt being at `travel_mm`.
     pub fn record(&mut self, record: ParcelRecord, travel_mm: f64) {
-        let due_mm = travel_mm + self.settings.publish_after_mm;
+        // At once, or when the belt is known to be there.
+        let due_mm = match self.settings.publish_after_mm {
+            0.0 => f64::NEG_INFINITY,
+            after_mm => travel_mm + after_mm,
+        };
         if self.waiting.is_full() {
             // Better early than never.
             self.publish_first();
