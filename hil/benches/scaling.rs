@@ -2,7 +2,7 @@
 //! `cargo bench --package hil --bench scaling`.
 //!
 //! The reference camera scaled from 0.3 to 5 megapixels over the same belt; the pipelines with one
-//! and two workers take turns, frame by frame, and with them two separate pipelines of one worker
+//! and two workers take turns, 20 frames each, and with them two separate pipelines of one worker
 //! each: what the machine's second processor gives at best, to work that shares nothing. The plot goes
 //! to `target/scaling.svg`.
 
@@ -14,6 +14,8 @@ use std::time::Instant;
 
 /// Frames that are timed, after the background is learned.
 const FRAMES: u64 = 160;
+/// Frames on end that one of them works on.
+const TURN: usize = 20;
 /// Image columns: 0.3, 0.6, 1.3, 2.3, 3.5 and 5 megapixels.
 const WIDTHS: [usize; 6] = [704, 1008, 1440, 1920, 2368, 2816];
 
@@ -54,20 +56,29 @@ fn measure(width: usize) -> Row {
     });
     let [one, two, left, right] = &mut pipelines;
     let mut times = [const { Vec::new() }; 3];
-    for (n, frame) in scene.frames.iter().enumerate() {
-        let raw = Plane::packed(frame, width, height).expect("this size");
+    let step = |pipeline: &mut Pipeline, n: usize| {
+        let raw = Plane::packed(&scene.frames[n], width, height).expect("this size");
         let time = FrameTime { index: n as u64, t_s: n as f64 / FPS };
-        let step = |pipeline: &mut Pipeline| {
-            pipeline.step(raw, time, &mut |_| {}).expect("this size");
+        pipeline.step(raw, time, &mut |_| {}).expect("this size");
+    };
+    // Inside its pool, as the appliance's vision thread is.
+    for turn in (0..scene.frames.len()).step_by(TURN) {
+        let frames = turn..(turn + TURN).min(scene.frames.len());
+        let timed = |work: &mut (dyn FnMut(usize) + Send), times: &mut Vec<f64>| {
+            for n in frames.clone() {
+                let start = Instant::now();
+                work(n);
+                if n >= 40 {
+                    times.push(1e3 * start.elapsed().as_secs_f64());
+                }
+            }
         };
-        let ms = [
-            timed_ms(|| pools[0].install(|| step(one))),
-            timed_ms(|| pools[1].install(|| step(two))),
-            timed_ms(|| pools[1].install(|| rayon::join(|| step(left), || step(right)))),
-        ];
-        if n >= 40 {
-            times.iter_mut().zip(ms).for_each(|(times, ms)| times.push(ms));
-        }
+        pools[0].install(|| timed(&mut |n| step(one, n), &mut times[0]));
+        pools[1].install(|| timed(&mut |n| step(two, n), &mut times[1]));
+        let mut both = |n| {
+            rayon::join(|| step(left, n), || step(right, n));
+        };
+        pools[1].install(|| timed(&mut both, &mut times[2]));
     }
     let [one, two, two_frames_ms] = times.map(|mut times| {
         times.sort_unstable_by(f64::total_cmp);
@@ -75,12 +86,6 @@ fn measure(width: usize) -> Row {
     });
     let [columns, rows] = scene.site.view.size_px;
     Row { megapixels: (columns * rows) as f64 * 1e-6, ms: [one, two], two_frames_ms }
-}
-
-fn timed_ms<T>(work: impl FnOnce() -> T) -> f64 {
-    let start = Instant::now();
-    std::hint::black_box(work());
-    1e3 * start.elapsed().as_secs_f64()
 }
 
 /// Cost over size, and the straight line through the origin with the least squared error.
