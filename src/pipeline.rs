@@ -201,6 +201,7 @@ impl Pipeline {
         self.background.forget();
         self.tracker.forget();
         self.odometry.forget();
+        self.stands_still = false;
     }
 
     /// Report parcels, or let them pass.

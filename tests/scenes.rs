@@ -342,15 +342,15 @@ fn told(scenario: &Scenario, at: u64, tell: impl Fn(&mut Pipeline)) -> Vec<Parce
 }
 
 /// One parcel in the zone at frame 60, another that comes when it has gone, at 150.
-fn two_parcels() -> Scenario {
+fn two_parcels(frames: u64, stop: &str) -> Scenario {
     let [first, second] =
         [-950.0, -3400.0].map(|x| parcel([220.0, 150.0, 90.0], 30.0, [x, 40.0], "kraft"));
-    scenario(310, 500.0, &(first + &second))
+    scenario(frames, 500.0, &(first + &second + stop))
 }
 
 #[test]
 fn a_belt_that_is_learned_anew_between_two_parcels_measures_both() {
-    let scenario = two_parcels();
+    let scenario = two_parcels(310, "");
     // The belt is empty, as the command says it must be.
     let records = told(&scenario, 125, Pipeline::learn);
     assert_eq!(records.len(), 2, "{records:?}");
@@ -358,8 +358,17 @@ fn a_belt_that_is_learned_anew_between_two_parcels_measures_both() {
 }
 
 #[test]
+fn a_belt_that_is_learned_anew_while_it_stands_still_measures_what_comes_then() {
+    let scenario = two_parcels(376, "[[belt.stop]]\nat_s = 3.9\nfor_s = 2.0\nramp_s = 0.2\n");
+    // At 5 s, in the middle of the stop: from 15 frames, not from the first one alone.
+    let records = told(&scenario, 150, Pipeline::learn);
+    assert_eq!(records.len(), 2, "{records:?}");
+    assert_sizes(&matched(&scenario, &records), FOOTPRINT_MM, HEIGHT_MM);
+}
+
+#[test]
 fn a_pipeline_that_is_stopped_reports_nothing_until_it_is_started() {
-    let scenario = two_parcels();
+    let scenario = two_parcels(310, "");
     assert!(told(&scenario, 20, |p| p.report_parcels(false)).is_empty());
     let first = told(&scenario, 125, |p| p.report_parcels(false));
     assert_eq!(first.len(), 1, "{first:?}");

@@ -112,8 +112,8 @@ fn plot(rows: &[Row]) -> String {
             "<path d=\"M70 330L{x:.1} {y:.1}\" stroke=\"{colour}\" stroke-dasharray=\"4 4\"/>\
              <text x=\"{:.1}\" y=\"{:.1}\" fill=\"{colour}\" text-anchor=\"end\">{label}: \
              {slope:.2} ns a pixel</text>",
-            x - 90.0,
-            y + 20.0,
+            if worker == 0 { x - 90.0 } else { x },
+            if worker == 0 { y + 20.0 } else { y + 110.0 },
         );
         for row in rows {
             let (x, y) = at(row.megapixels, row.ms[worker]);

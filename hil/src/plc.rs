@@ -200,10 +200,11 @@ impl Plc {
         if sequence[0] != sequence[1] {
             self.complaints.push(format!("torn: {parcel:?}"));
         }
-        // Acknowledged without an answer before the cable was pulled: not a new one.
+        // Acknowledged without an answer, or not yet on the disk when the appliance was killed: not a
+        // new one.
         let last = self.taken.last().map_or(0, |(last, _)| last.sequence[0]);
         match sequence[0].wrapping_sub(last) {
-            0 => {}
+            0 | 0x8000_0000.. => {}
             1 => {
                 let chute = if parcel.size_mm[0] <= 400.0 { Chute::Small } else { Chute::Large };
                 self.taken.push((parcel, chute));
@@ -211,7 +212,8 @@ impl Plc {
             _ => self.complaints.push(format!("after {last}: {parcel:?}")),
         }
         let acknowledge = self.map["command.acknowledge"].address;
-        client.write(acknowledge, &[sequence[0] as u16])?;
+        let taken = self.taken.last().map_or(0, |(last, _)| last.sequence[0]);
+        client.write(acknowledge, &[taken as u16])?;
         self.client = Some(client);
         Ok(true)
     }

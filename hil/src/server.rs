@@ -51,7 +51,8 @@ impl Server {
         let stopped = Arc::clone(&stop);
         let thread = std::thread::spawn(move || {
             let plc = Settings { queue: true, ..Settings::default() };
-            let link = Link::new(plc, settings.word_order, journal, Instant::now());
+            let sends = can.interface.is_some();
+            let link = Link::new(plc, settings.word_order, sends, journal, Instant::now());
             let mut can = CanLink::<CanFdSocket>::new(can, Instant::now());
             let mut vision = VisionStatus { ready: true, ..VisionStatus::default() };
             let served = modbus::serve(listener, &settings, link, |link| {

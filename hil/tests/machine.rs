@@ -133,7 +133,7 @@ fn bus_off(machine: &mut Machine) {
     let mut plc = Plc::new(machine.modbus);
     poll(&mut plc, Duration::from_mins(2), |plc| plc.taken.len() >= 20);
     machine.run("cansend vcan0 20000040#0000000000000000; sleep 1");
-    assert_eq!((status(machine, "can_state"), status(machine, "reason")), (3, 5));
+    assert_eq!((status(machine, "can_state"), status(machine, "reason")), (3, 3));
     machine.run("cansend vcan0 20000100#0000000000000000; sleep 1");
     assert_eq!(status(machine, "can_state"), 1);
     poll(&mut plc, Duration::from_mins(2), |plc| plc.taken.len() >= PARCELS as usize);

@@ -2,18 +2,17 @@
 //!
 //! Never waits: a bus that takes no frame is tried again at the next step. One parcel at a time
 //! is turned into frames; others wait in the link. After bus off, and after the interface was down,
-//! the last parcels are sent again, for the controller may have forgotten their frames.
+//! the last parcels are sent again, for the controller may have forgotten their frames. A controller
+//! that is off the bus takes frames and drops them: the interface's carrier tells, also when the
+//! driver's word was missed.
 
-use super::frames::{self, Frame, Message, Payload, Received};
-use super::link::{Link, Outcome, REPEATED};
+use super::bus::{Bus, Event, would_block};
+use super::frames::{self, Frame, Message, Received};
+use super::link::{Link, REPEATED};
 use super::registers::{CanState, CanStatus};
 use crate::config::Can as Settings;
 use crate::event::ParcelRecord;
 use heapless::Deque;
-use socketcan::{
-    CanAnyFrame, CanDataFrame, CanFdFrame, CanFdSocket, EmbeddedFrame, Frame as _, Socket,
-    SocketOptions, StandardId,
-};
 use std::io::{Error, ErrorKind};
 use std::time::{Duration, Instant};
 
@@ -21,6 +20,12 @@ const HEARTBEAT_PERIOD: Duration = Duration::from_millis(100);
 const STATUS_PERIOD: Duration = Duration::from_secs(1);
 /// An interface that is not there is looked for this often.
 const REOPEN_PERIOD: Duration = Duration::from_secs(1);
+/// The carrier is looked at this often.
+const CARRIER_PERIOD: Duration = Duration::from_millis(500);
+/// After the bus is back the kernel drops frames until it has noticed.
+const SETTLE: Duration = Duration::from_millis(200);
+/// Outcomes that wait to be sent.
+const RESULTS_MAX: usize = 8;
 /// Frames of one parcel, or of the status block.
 const OUTGOING_MAX: usize = 32;
 /// Frames sent in one step, of 2 ms: a quarter of what a bus of 500 kbit/s carries, so that others get
@@ -28,79 +33,6 @@ const OUTGOING_MAX: usize = 32;
 const SENT_MAX: usize = 2;
 /// Frames taken in one step: a flood does not hold up the rest.
 const RECEIVED_MAX: usize = 128;
-/// What a bus brings.
-#[derive(Clone, Debug, PartialEq, Eq)]
-pub enum Event {
-    /// A data frame with a standard identifier.
-    Frame {
-        /// Its identifier.
-        id: u16,
-        /// Its bytes.
-        payload: Payload,
-    },
-    /// An error frame of the driver, `linux/can/error.h`.
-    Error {
-        /// Classes of errors, as bits.
-        class: u32,
-        /// Details.
-        data: [u8; 8],
-    },
-    /// Something that is none of ours.
-    Other,
-}
-
-/// A CAN bus: the kernel's, or a test's.
-pub trait Bus: Sized {
-    /// Open an interface.
-    fn open(interface: &str) -> std::io::Result<Self>;
-    /// Send a frame, or fail at once with [`ErrorKind::WouldBlock`] or `ENOBUFS`.
-    fn send(&mut self, id: u16, payload: &[u8], fd: bool) -> std::io::Result<()>;
-    /// The next event, [`ErrorKind::WouldBlock`] when there is none.
-    fn receive(&mut self) -> std::io::Result<Event>;
-}
-
-impl Bus for CanFdSocket {
-    fn open(interface: &str) -> std::io::Result<Self> {
-        let socket = <Self as Socket>::open(interface)?;
-        socket.set_nonblocking(true)?;
-        socket.set_error_filter_accept_all()?;
-        Ok(socket)
-    }
-
-    fn send(&mut self, id: u16, payload: &[u8], fd: bool) -> std::io::Result<()> {
-        let wrong = || Error::from(ErrorKind::InvalidInput);
-        let id = StandardId::new(id).ok_or_else(wrong)?;
-        if fd {
-            self.write_frame(&CanFdFrame::new(id, payload).ok_or_else(wrong)?)
-        } else {
-            self.write_frame(&CanDataFrame::new(id, payload).ok_or_else(wrong)?)
-        }
-    }
-
-    fn receive(&mut self) -> std::io::Result<Event> {
-        let data = |id: u32, extended: bool, bytes: &[u8]| {
-            if extended {
-                return Event::Other;
-            }
-            // A frame of the kernel has at most 64 bytes.
-            Payload::from_slice(bytes)
-                .map_or(Event::Other, |payload| Event::Frame { id: id as u16, payload })
-        };
-        Ok(match self.read_frame()? {
-            CanAnyFrame::Normal(frame) => data(frame.raw_id(), frame.is_extended(), frame.data()),
-            CanAnyFrame::Fd(frame) => data(frame.raw_id(), frame.is_extended(), frame.data()),
-            CanAnyFrame::Remote(_) => Event::Other,
-            CanAnyFrame::Error(frame) => {
-                let mut bytes = [0; 8];
-                for (byte, value) in bytes.iter_mut().zip(frame.data()) {
-                    *byte = *value;
-                }
-                Event::Error { class: frame.error_bits(), data: bytes }
-            }
-        })
-    }
-}
-
 /// The appliance on a CAN bus.
 pub struct CanLink<B> {
     settings: Settings,
@@ -110,11 +42,18 @@ pub struct CanLink<B> {
     recent: Deque<ParcelRecord, REPEATED>,
     /// Parcels of `recent` that are to be sent again.
     repeat: usize,
+    results: Deque<Frame, RESULTS_MAX>,
     counter: u8,
-    ticket: u16,
+    /// Frames that the interface refused for ever.
+    refused: u64,
+    /// The carrier when it was last looked at.
+    carrier: Option<bool>,
+    carrier_due: Instant,
     heartbeat_due: Instant,
     status_due: Instant,
     open_due: Instant,
+    /// Nothing is sent before.
+    settled: Instant,
 }
 
 impl<B: Bus> CanLink<B> {
@@ -127,35 +66,80 @@ impl<B: Bus> CanLink<B> {
             outgoing: Deque::new(),
             recent: Deque::new(),
             repeat: 0,
+            results: Deque::new(),
             counter: 0,
-            ticket: 0,
+            refused: 0,
+            carrier: None,
+            carrier_due: now,
             heartbeat_due: now,
             status_due: now,
             open_due: now,
+            settled: now,
         }
     }
 
     /// State and counters.
     pub fn status(&self) -> CanStatus {
-        self.status
+        CanStatus { frames_refused: self.refused, ..self.status }
+    }
+
+    /// Whether nothing waits to be sent.
+    pub fn is_idle(&self) -> bool {
+        self.outgoing.is_empty() && self.results.is_empty() && self.repeat == 0
     }
 
     /// Take what has come, send what is due.
     pub fn step(&mut self, link: &mut Link, now: Instant) {
-        let Some(interface) = &self.settings.interface else { return };
+        let Some(interface) = self.settings.interface.clone() else { return };
         if self.bus.is_none() && now >= self.open_due {
             self.open_due = now + REOPEN_PERIOD;
-            match B::open(interface) {
+            match B::open(&interface, self.settings.fd) {
                 Ok(bus) => {
-                    tracing::info!(interface, "CAN interface opened");
                     self.bus = Some(bus);
-                    self.status.state = CanState::Active;
+                    (self.carrier, self.carrier_due) = (None, now);
+                    self.back(now);
                 }
                 Err(error) => self.lost(&error),
             }
         }
+        if self.bus.is_some() && now >= self.carrier_due {
+            self.carrier_due = now + CARRIER_PERIOD;
+            self.look_at_carrier(B::carrier(&interface), now);
+        }
         self.receive(link, now);
-        self.send(link, now);
+        if now >= self.settled {
+            self.send(link, now);
+        }
+    }
+
+    /// A carrier that goes is bus off, one that comes is its end, whatever the driver reported. One
+    /// that stays says nothing: virtual buses have theirs always.
+    fn look_at_carrier(&mut self, carrier: Option<bool>, now: Instant) {
+        let before = std::mem::replace(&mut self.carrier, carrier);
+        match (before, carrier) {
+            (Some(true) | None, Some(false)) => self.bus_off(),
+            (Some(false), Some(true)) if self.status.state == CanState::BusOff => self.back(now),
+            _ => {}
+        }
+    }
+
+    /// The bus is there, or there again.
+    fn back(&mut self, now: Instant) {
+        if self.status.state == CanState::Active {
+            return;
+        }
+        tracing::info!(interface = self.settings.interface, "CAN bus active");
+        self.status.state = CanState::Active;
+        self.repeat = self.recent.len();
+        self.settled = now + SETTLE;
+    }
+
+    fn bus_off(&mut self) {
+        if self.status.state != CanState::BusOff {
+            self.status.bus_offs += 1;
+            tracing::error!(interface = self.settings.interface, "CAN bus off");
+        }
+        self.status.state = CanState::BusOff;
     }
 
     /// The interface is down or gone.
@@ -163,7 +147,6 @@ impl<B: Bus> CanLink<B> {
         if self.status.state != CanState::Down {
             tracing::error!(interface = self.settings.interface, %error, "CAN interface lost");
             self.status.state = CanState::Down;
-            self.repeat = self.recent.len();
         }
         // ENETDOWN alone ends by itself.
         if error.raw_os_error() != Some(rustix::io::Errno::NETDOWN.raw_os_error()) {
@@ -178,18 +161,19 @@ impl<B: Bus> CanLink<B> {
                 Ok(Event::Frame { id, payload }) => {
                     if self.status.state == CanState::BusOff {
                         // Who receives is on the bus, whatever was or was not reported.
-                        self.status.state = CanState::Active;
+                        self.back(now);
                     }
                     match frames::decode(id.wrapping_sub(self.settings.base_id), &payload) {
                         Some(Received::Command(ticket, command, argument)) => {
                             link.command(ticket, command, argument);
+                            self.answer(link);
                         }
                         Some(Received::Encoder(count)) => link.count(count, now),
                         Some(Received::Heartbeat(value)) => link.heartbeat(value, now),
                         None => {}
                     }
                 }
-                Ok(Event::Error { class, data }) => self.error(class, data),
+                Ok(Event::Error { class, data }) => self.error(class, data, now),
                 Ok(Event::Other) => {}
                 Err(error) if would_block(&error) => return,
                 Err(error) => return self.lost(&error),
@@ -197,10 +181,19 @@ impl<B: Bus> CanLink<B> {
         }
     }
 
+    /// Every command is answered, a repeated one again.
+    fn answer(&mut self, link: &Link) {
+        if self.results.is_full() {
+            self.results.pop_front();
+        }
+        let results = &mut self.results;
+        // invariant: there is room
+        frames::result(link.status(), |frame| drop(results.push_back(frame)));
+    }
+
     /// Error frames, `linux/can/error.h`.
-    fn error(&mut self, class: u32, data: [u8; 8]) {
+    fn error(&mut self, class: u32, data: [u8; 8], now: Instant) {
         const CONTROLLER: u32 = 0x04;
-        const ACKNOWLEDGE: u32 = 0x20;
         const BUS_OFF: u32 = 0x40;
         const RESTARTED: u32 = 0x100;
         const COUNTERS: u32 = 0x200;
@@ -211,16 +204,15 @@ impl<B: Bus> CanLink<B> {
             (status.transmit_errors, status.receive_errors) = (data[6], data[7]);
         }
         if class & BUS_OFF != 0 {
-            if status.state != CanState::BusOff {
-                status.bus_offs += 1;
-                self.repeat = self.recent.len();
-                tracing::error!(interface = self.settings.interface, "CAN bus off");
+            self.bus_off();
+        } else if class & RESTARTED != 0 {
+            self.back(now);
+        } else if class & CONTROLLER != 0 && status.state != CanState::BusOff {
+            if data[1] & ACTIVE != 0 {
+                status.state = CanState::Active;
+            } else if data[1] & PASSIVE != 0 {
+                status.state = CanState::Passive;
             }
-            status.state = CanState::BusOff;
-        } else if class & RESTARTED != 0 || class & CONTROLLER != 0 && data[1] & ACTIVE != 0 {
-            status.state = CanState::Active;
-        } else if class & ACKNOWLEDGE != 0 || class & CONTROLLER != 0 && data[1] & PASSIVE != 0 {
-            status.state = CanState::Passive;
         }
     }
 
@@ -235,23 +227,32 @@ impl<B: Bus> CanLink<B> {
                 Ok(()) => {
                     self.outgoing.pop_front();
                     if self.status.state == CanState::Down {
-                        tracing::info!(interface = self.settings.interface, "CAN is back");
-                        self.status.state = CanState::Active;
+                        return self.back(now);
                     }
                 }
                 Err(error) if would_block(&error) => return,
+                // Tried again it would be refused again.
+                Err(error) if error.kind() == ErrorKind::InvalidInput => {
+                    self.outgoing.pop_front();
+                    self.refused += 1;
+                }
                 Err(error) => return self.lost(&error),
             }
         }
     }
 
-    /// What is most urgent: a parcel, then an outcome, then what is due.
+    /// What is most urgent: an outcome, a heartbeat that is due, a parcel, the status.
     fn next_frames(&mut self, link: &mut Link, now: Instant) {
         let outgoing = &mut self.outgoing;
         // invariant: a message has fewer frames than there is room for
         let mut emit = |frame: Frame| drop(outgoing.push_back(frame));
         let reachable = matches!(self.status.state, CanState::Active | CanState::Passive);
-        if reachable && self.repeat > 0 {
+        if let Some(result) = self.results.pop_front() {
+            emit(result);
+        } else if now >= self.heartbeat_due {
+            self.heartbeat_due = now + HEARTBEAT_PERIOD;
+            frames::heartbeat(link.status(), emit);
+        } else if reachable && self.repeat > 0 {
             if let Some(record) = self.recent.iter().nth(self.recent.len() - self.repeat) {
                 frames::parcel(record, self.settings.fd, emit);
             }
@@ -262,14 +263,6 @@ impl<B: Bus> CanLink<B> {
                 self.recent.pop_front();
             }
             let _ = self.recent.push_back(record); // invariant: there is room
-        } else if link.status().ticket != self.ticket {
-            self.ticket = link.status().ticket;
-            if link.status().outcome != Outcome::None as u16 {
-                frames::result(link.status(), emit);
-            }
-        } else if now >= self.heartbeat_due {
-            self.heartbeat_due = now + HEARTBEAT_PERIOD;
-            frames::heartbeat(link.status(), emit);
         } else if now >= self.status_due {
             self.status_due = now + STATUS_PERIOD;
             self.counter = self.counter.wrapping_add(1);
@@ -278,17 +271,11 @@ impl<B: Bus> CanLink<B> {
     }
 }
 
-/// The bus takes or has no frame at the moment.
-fn would_block(error: &Error) -> bool {
-    let no_buffers = rustix::io::Errno::NOBUFS.raw_os_error();
-    matches!(error.kind(), ErrorKind::WouldBlock | ErrorKind::Interrupted)
-        || error.raw_os_error() == Some(no_buffers)
-}
-
 #[cfg(test)]
 mod tests {
     use super::*;
     use crate::config::{Plc, WordOrder};
+    use crate::plc::frames::Payload;
     use crate::plc::journal::Journal;
     use crate::plc::record;
     use crate::plc::registers::VisionStatus;
@@ -302,6 +289,7 @@ mod tests {
         coming: VecDeque<Event>,
         error: Option<i32>,
         room: usize,
+        carrier: Option<bool>,
     }
 
     thread_local! {
@@ -311,10 +299,14 @@ mod tests {
     struct TestBus;
 
     impl Bus for TestBus {
-        fn open(_: &str) -> std::io::Result<Self> {
+        fn open(_: &str, _: bool) -> std::io::Result<Self> {
             WIRE.with_borrow(|wire| {
                 wire.error.map_or(Ok(Self), |e| Err(Error::from_raw_os_error(e)))
             })
+        }
+
+        fn carrier(_: &str) -> Option<bool> {
+            WIRE.with_borrow(|wire| wire.carrier)
         }
 
         fn send(&mut self, id: u16, payload: &[u8], _: bool) -> std::io::Result<()> {
@@ -347,8 +339,11 @@ mod tests {
             WIRE.set(Wire { room: usize::MAX, ..Wire::default() });
             let now = Instant::now();
             let settings = Settings { interface: Some("can0".into()), ..Settings::default() };
-            let link = Link::new(Plc::default(), WordOrder::HighFirst, Journal::default(), now);
-            Self { link, can: CanLink::new(settings, now), now }
+            let link =
+                Link::new(Plc::default(), WordOrder::HighFirst, true, Journal::default(), now);
+            let mut bench = Self { link, can: CanLink::new(settings, now), now };
+            bench.settle();
+            bench
         }
 
         /// 10 ms later, in visits of 2 ms.
@@ -358,6 +353,11 @@ mod tests {
                 self.link.update(&VisionStatus::default(), &self.can.status(), None, self.now);
                 self.can.step(&mut self.link, self.now);
             }
+        }
+
+        /// Until a bus that is back is used.
+        fn settle(&mut self) {
+            (0..25).for_each(|_| self.step());
         }
 
         fn parcel(&mut self) {
@@ -421,6 +421,7 @@ mod tests {
     fn after_bus_off_the_last_parcels_are_sent_again() {
         let mut bench = Bench::new();
         (0..3).for_each(|_| bench.parcel());
+        bench.settle();
         let error = |class, data| wire(|wire| wire.coming.push_back(Event::Error { class, data }));
         error(0x40, [0; 8]);
         wire(|wire| wire.room = 0);
@@ -429,7 +430,7 @@ mod tests {
         (0..2).for_each(|_| bench.parcel());
         error(0x100, [0; 8]);
         wire(|wire| wire.room = usize::MAX);
-        (0..8).for_each(|_| bench.step());
+        (0..3).for_each(|_| bench.settle());
         assert_eq!(bench.can.status().state, CanState::Active);
         assert_eq!(Bench::received(), [1, 2, 3, 1, 2, 3, 4, 5]);
     }
@@ -444,6 +445,53 @@ mod tests {
         event(Event::Frame { id: 0x123, payload: Payload::new() });
         bench.step();
         assert_eq!(bench.can.status().state, CanState::Active);
+    }
+
+    #[test]
+    fn a_controller_that_is_off_the_bus_when_it_is_opened_is_waited_for() {
+        let mut bench = Bench::new();
+        // The driver told of it before anybody listened, and takes frames all the same.
+        wire(|wire| wire.carrier = Some(false));
+        bench.can.bus = None;
+        (0..6).for_each(|_| bench.settle());
+        assert_eq!(bench.can.status().state, CanState::BusOff);
+        (0..2).for_each(|_| bench.parcel());
+        bench.settle();
+        assert!(Bench::received().is_empty());
+        wire(|wire| wire.carrier = Some(true));
+        (0..4).for_each(|_| bench.settle());
+        assert_eq!((bench.can.status().state, bench.can.status().bus_offs), (CanState::Active, 1));
+        assert_eq!(Bench::received(), [1, 2]);
+    }
+
+    #[test]
+    fn a_frame_that_the_interface_never_takes_is_counted_and_holds_up_nothing() {
+        let mut bench = Bench::new();
+        wire(|wire| wire.error = Some(rustix::io::Errno::INVAL.raw_os_error()));
+        bench.parcel();
+        wire(|wire| wire.error = None);
+        bench.settle();
+        bench.parcel();
+        bench.settle();
+        assert!(bench.can.status().frames_refused > 0);
+        assert_eq!(bench.can.status().state, CanState::Active);
+        let last = WIRE.with_borrow(|wire| wire.sent.iter().rev().any(|(_, b)| b[..2] == [2, 0]));
+        assert!(last, "the next parcel goes out");
+    }
+
+    #[test]
+    fn every_command_is_answered_also_two_at_once_and_one_that_comes_again() {
+        let mut bench = Bench::new();
+        for ticket in [7, 8, 8] {
+            let payload = Payload::from_slice(&[0, ticket, 0, 2, 0, 0, 0, 0]).expect("short");
+            wire(|wire| wire.coming.push_back(Event::Frame { id: 0x508, payload }));
+        }
+        bench.step();
+        let answers = WIRE.with_borrow(|wire| {
+            let results = wire.sent.iter().filter(|(id, _)| *id == 0x504);
+            results.map(|(_, bytes)| bytes[1]).collect::<Vec<_>>()
+        });
+        assert_eq!(answers, [7, 8, 8]);
     }
 
     #[test]
@@ -465,10 +513,10 @@ mod tests {
     fn more_parcels_than_can_wait_are_counted() {
         let mut bench = Bench::new();
         wire(|wire| wire.error = Some(rustix::io::Errno::NETDOWN.raw_os_error()));
+        bench.settle();
         (0..40).for_each(|_| bench.parcel());
         wire(|wire| wire.error = None);
         (0..200).for_each(|_| bench.step());
-        // One was on its way; of the others 32 could wait.
         assert!(Bench::received().into_iter().eq(9..=40));
         assert_eq!(bench.link.status().can.parcels_dropped, 8);
     }

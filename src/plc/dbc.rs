@@ -1,7 +1,7 @@
 //! The CAN messages as a DBC file, from the same tables as the frames.
 
+use super::command::COMMANDS;
 use super::frames::{self, Message, Place};
-use super::link::COMMANDS;
 use super::registers::REASONS;
 use super::table::{Field, Type};
 use std::fmt::Write;

@@ -1,7 +1,8 @@
 //! The register map as documents: Markdown to read, CSV to import.
 
+use super::command::{COMMANDS, Outcome};
 use super::frames;
-use super::link::{COMMANDS, Outcome, REPEATED};
+use super::link::REPEATED;
 use super::registers::{
     COMMAND, COMMAND_COUNT, COMMAND_FIELDS, COUNT, LATEST, MAP_VERSION, PARCEL_FIELDS,
     PARCEL_STRIDE, QUEUE_HEAD, REASONS, RING, RING_PARCELS, STATUS_FIELDS,
@@ -50,7 +51,8 @@ pub fn markdown() -> String {
         text,
         "\n## Commands, from address {COMMAND}; written by the PLC\n\n\
          Two-register values are written whole. A request is carried out whole or refused whole: exception 2 for\n\
-         an address, exception 3 for a value. Write command and argument before or together with `ticket`; the\n\
+         an address, exception 3 for a value. In a write of several registers an acknowledgment of a parcel that\n\
+         never was is left out instead: a PLC may hold a number from before a restart. Write command and argument before or together with `ticket`; the\n\
          outcome is there when `ticket_done` equals it. The same ticket again does nothing, so a write\n\
          that was not answered may be repeated.\n"
     );
@@ -72,7 +74,8 @@ pub fn markdown() -> String {
          (`sequence` 0: none); writing the low word of its sequence number to `acknowledge` brings the next.\n\
          Up to {RING_PARCELS} wait; one more, and the oldest goes and is counted in `queue_overflows`.\n\
          A parcel without a size gets no sequence number; `parcels_unmeasured`\n\
-         counts it. Where a parcel is now: x + status `belt_travel` - its own `belt_travel`.\n\
+         counts it. Where a parcel is now: x + (status `belt_travel` - its own `belt_travel`), the difference\n\
+         taken in 32 bits, so that it survives the wrap.\n\
          Addresses below are of the latest parcel.\n"
     );
     table(&mut text, PARCEL_FIELDS, LATEST);
@@ -96,7 +99,7 @@ fn can(text: &mut String) {
          | +1 | the rest of the status block, in segments | once a second |\n\
          | +2 | a parcel, in {segments} segments of 8 bytes | when it is published |\n\
          | +3 | with `can.fd`: a parcel in one frame of 64 bytes | when it is published |\n\
-         | +4 | ticket and result of a command | after a command |\n\
+         | +4 | ticket and result of a command | after every command, a repeated one too |\n\
          | +8 | from the PLC: ticket, command, argument | |\n\
          | +9 | from the PLC: encoder count | as often as possible |\n\
          | +10 | from the PLC: its heartbeat | |\n\n\

@@ -1,7 +1,8 @@
 //! What a PLC was told, kept over restarts: boots, the last parcels, what was acknowledged.
 //!
 //! A file is written beside the old one, brought to the disk and renamed over it, so that a power
-//! cut leaves one or the other. A disk that fails is logged and does not stop the belt.
+//! cut leaves one or the other. A thread of its own does so: what waits for the disk would make
+//! encoder counts late. A disk that fails is logged and does not stop the belt.
 
 use super::link::QUEUE_PARCELS;
 use crate::error::{Error, Result};
@@ -10,22 +11,38 @@ use serde::{Deserialize, Serialize};
 use std::fs::File;
 use std::io::BufWriter;
 use std::path::{Path, PathBuf};
+use std::sync::Arc;
+use std::sync::atomic::{AtomicU64, Ordering};
+use std::sync::mpsc::{Sender, channel};
+use std::thread::JoinHandle;
 
 /// The file's content.
 #[derive(Clone, Debug, Default, Serialize, Deserialize)]
 struct State {
     boots: u16,
     acknowledged: u32,
+    sent: u32,
     records: Vec<ParcelRecord>,
 }
 
 /// The journal, on a disk or in memory only.
 #[derive(Debug, Default)]
 pub struct Journal {
-    path: Option<PathBuf>,
     state: State,
-    changed: bool,
-    failed: bool,
+    /// What was noted, counted, and how much of it was given to the writer.
+    noted: u64,
+    given: u64,
+    writer: Option<Writer>,
+}
+
+/// The thread that waits for the disk, so that nobody else does.
+#[derive(Debug)]
+struct Writer {
+    /// Ends the thread when it is dropped.
+    states: Option<Sender<(State, u64)>>,
+    /// How much of what was noted is on the disk.
+    saved: Arc<AtomicU64>,
+    thread: Option<JoinHandle<()>>,
 }
 
 impl Journal {
@@ -52,9 +69,9 @@ impl Journal {
         let surplus = state.records.len().saturating_sub(QUEUE_PARCELS);
         state.records.drain(..surplus);
         state.boots = state.boots.wrapping_add(1);
-        let journal = Self { path: Some(path.to_owned()), state, changed: false, failed: false };
-        journal.write(path).map_err(failure)?;
-        Ok(journal)
+        write(path, &state).map_err(failure)?;
+        let writer = Some(Writer::start(path.to_owned()).map_err(failure)?);
+        Ok(Self { state, noted: 0, given: 0, writer })
     }
 
     /// Starts of the appliance.
@@ -77,42 +94,92 @@ impl Journal {
         &self.state.records
     }
 
-    /// Note a parcel.
-    pub fn note(&mut self, record: &ParcelRecord) {
+    /// Sequence number up to which parcels were sent over CAN.
+    pub fn sent(&self) -> u32 {
+        self.state.sent
+    }
+
+    /// Note a parcel. Returns a number: once [`Journal::saved`] has reached it, no restart forgets it.
+    pub fn note(&mut self, record: &ParcelRecord) -> u64 {
         if self.state.records.len() == QUEUE_PARCELS {
             self.state.records.remove(0);
         }
         self.state.records.push(*record);
-        self.changed = true;
+        self.noted += 1;
+        self.noted
     }
 
     /// Note an acknowledgment.
     pub fn acknowledge(&mut self, sequence: u32) {
         self.state.acknowledged = sequence;
-        self.changed = true;
+        self.noted += 1;
     }
 
-    /// Bring what has changed to the disk.
+    /// Note that a parcel was sent over CAN.
+    pub fn send(&mut self, sequence: u32) {
+        self.state.sent = sequence;
+        self.noted += 1;
+    }
+
+    /// Have the disk take what was noted; does not wait for it.
     pub fn save(&mut self) {
-        let Some(path) = self.path.as_ref().filter(|_| self.changed) else { return };
-        let written = self.write(path);
-        if let Err(error) = &written
-            && !self.failed
-        {
-            tracing::error!(path = %path.display(), %error, "state file cannot be written");
+        let Some(states) = self.writer.as_ref().and_then(|writer| writer.states.as_ref()) else {
+            return;
+        };
+        if self.given < self.noted && states.send((self.state.clone(), self.noted)).is_ok() {
+            self.given = self.noted;
         }
-        (self.failed, self.changed) = (written.is_err(), false);
     }
 
-    fn write(&self, path: &Path) -> std::io::Result<()> {
-        let new = path.with_extension("new");
-        let mut file = BufWriter::new(File::create(&new)?);
-        serde_json::to_writer(&mut file, &self.state)?;
-        file.into_inner()?.sync_all()?;
-        std::fs::rename(&new, path)?;
-        let folder = path.parent().filter(|folder| !folder.as_os_str().is_empty());
-        File::open(folder.unwrap_or(Path::new(".")))?.sync_all()
+    /// How much of what was noted is on the disk; in memory only, all of it is as safe as it gets.
+    pub fn saved(&self) -> u64 {
+        self.writer.as_ref().map_or(u64::MAX, |writer| writer.saved.load(Ordering::Acquire))
     }
+}
+
+impl Writer {
+    fn start(path: PathBuf) -> std::io::Result<Self> {
+        let (states, incoming) = channel::<(State, u64)>();
+        let saved = Arc::<AtomicU64>::default();
+        let done = Arc::clone(&saved);
+        let mut failed = false;
+        let thread = std::thread::Builder::new().name("journal".into()).spawn(move || {
+            while let Ok(first) = incoming.recv() {
+                // Of several states that wait, the last says it all.
+                let (state, noted) = incoming.try_iter().last().unwrap_or(first);
+                let written = write(&path, &state);
+                if let Err(error) = &written
+                    && !failed
+                {
+                    tracing::error!(path = %path.display(), %error, "state file cannot be written");
+                }
+                failed = written.is_err();
+                // The belt goes on without a disk.
+                done.store(noted, Ordering::Release);
+            }
+        })?;
+        Ok(Self { states: Some(states), saved, thread: Some(thread) })
+    }
+}
+
+impl Drop for Writer {
+    fn drop(&mut self) {
+        self.states = None;
+        if let Some(thread) = self.thread.take() {
+            // What it was given is written; it has nothing else to say.
+            let _ = thread.join();
+        }
+    }
+}
+
+fn write(path: &Path, state: &State) -> std::io::Result<()> {
+    let new = path.with_extension("new");
+    let mut file = BufWriter::new(File::create(&new)?);
+    serde_json::to_writer(&mut file, state)?;
+    file.into_inner()?.sync_all()?;
+    std::fs::rename(&new, path)?;
+    let folder = path.parent().filter(|folder| !folder.as_os_str().is_empty());
+    File::open(folder.unwrap_or(Path::new(".")))?.sync_all()
 }
 
 #[cfg(test)]
@@ -132,12 +199,19 @@ mod tests {
         let path = folder("journal").join("state.json");
         let mut journal = Journal::open(&path).expect("writable");
         assert_eq!((journal.boots(), journal.sequence()), (1, 0));
-        (1..=40).for_each(|seq| journal.note(&record(seq)));
+        let mut last = 0;
+        (1..=40).for_each(|seq| last = journal.note(&record(seq)));
+        assert!(journal.saved() < last, "nobody was told to save");
         journal.acknowledge(30);
+        journal.send(35);
         journal.save();
-        drop(journal); // as a kill does: nothing is written at the end
+        while journal.saved() < last {
+            std::thread::sleep(std::time::Duration::from_millis(1));
+        }
+        std::mem::forget(journal); // as a kill does: nothing is written at the end
         let journal = Journal::open(&path).expect("writable");
-        assert_eq!((journal.boots(), journal.sequence(), journal.acknowledged()), (2, 40, 30));
+        assert_eq!((journal.boots(), journal.sequence()), (2, 40));
+        assert_eq!((journal.acknowledged(), journal.sent()), (30, 35));
         assert!(journal.records().iter().map(|r| r.seq).eq(9..=40));
         assert_eq!(journal.records()[0], record(9));
     }

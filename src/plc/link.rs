@@ -4,6 +4,7 @@
 //! In: records and status from vision; register writes and CAN commands from the PLC. Out: the
 //! register image; records to be sent over CAN; requests to vision. Owns: sequence numbers.
 
+use super::command::{Outcome, Request};
 use super::journal::Journal;
 use super::present::presented;
 use super::registers::{
@@ -32,50 +33,6 @@ const SILENCE: Duration = Duration::from_secs(1);
 /// Largest scale interval that a command may set, tenths of a mm.
 const SCALE_INTERVAL_MAX: u32 = 500;
 
-/// What a PLC asks of the vision thread.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub enum Request {
-    /// The belt is empty: forget the background and learn it anew.
-    Learn,
-    /// Report parcels, or do not.
-    Report(bool),
-}
-
-/// Codes of the commands and their meanings.
-pub const COMMANDS: [(u16, &str); 5] = [
-    (1, "acknowledge parcels up to sequence number `argument`, as register `acknowledge` does"),
-    (2, "learn the empty belt anew: takes background.learn_frames, parcels in view are forgotten"),
-    (3, "start: report parcels"),
-    (4, "stop: report none until started"),
-    (5, "round dimensions to multiples of `argument` tenths of a mm, 1 to 500"),
-];
-
-/// What became of a command.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub enum Outcome {
-    /// There was none.
-    None,
-    /// Done.
-    Done,
-    /// No such command.
-    Unknown,
-    /// The argument is out of range.
-    Argument,
-    /// Vision is busy with earlier ones: try again.
-    Busy,
-}
-
-impl Outcome {
-    /// Codes and meanings.
-    pub const ALL: [(Self, &str); 5] = [
-        (Self::None, "no command yet"),
-        (Self::Done, "done"),
-        (Self::Unknown, "no such command"),
-        (Self::Argument, "argument out of range: nothing was changed"),
-        (Self::Busy, "busy with earlier commands: try again"),
-    ];
-}
-
 /// Why a register write was refused; it then has changed nothing.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Refusal {
@@ -94,7 +51,11 @@ pub struct Link {
     block: CommandBlock,
     journal: Journal,
     waiting: Deque<(ParcelRecord, f64), WAITING_MAX>,
+    /// Numbered, and on their way to the disk: with what the journal must have saved.
+    numbered: Deque<(ParcelRecord, u64), WAITING_MAX>,
     queue: Deque<ParcelRecord, QUEUE_PARCELS>,
+    /// There is a CAN bus.
+    sends: bool,
     to_send: Deque<ParcelRecord, QUEUE_PARCELS>,
     /// Parcels that found `to_send` full.
     unsent: u64,
@@ -113,8 +74,15 @@ struct Beats {
 }
 
 impl Link {
-    /// What was known at the last start is taken up again from the journal.
-    pub fn new(settings: Settings, order: WordOrder, journal: Journal, now: Instant) -> Self {
+    /// What was known at the last start is taken up again from the journal. `sends`: parcels are
+    /// kept for [`Link::next_to_send`].
+    pub fn new(
+        settings: Settings,
+        order: WordOrder,
+        sends: bool,
+        journal: Journal,
+        now: Instant,
+    ) -> Self {
         let status = Status {
             scale_interval_mm: settings.scale_interval_mm,
             boots: journal.boots(),
@@ -130,7 +98,9 @@ impl Link {
             block: CommandBlock::default(),
             journal,
             waiting: Deque::new(),
+            numbered: Deque::new(),
             queue: Deque::new(),
+            sends,
             to_send: Deque::new(),
             unsent: 0,
             counts: Deque::new(),
@@ -139,17 +109,17 @@ impl Link {
             encoder_alive: None,
             beats: Beats { start: now, frames: 0, last_frame: now },
         };
-        let acknowledged = link.journal.acknowledged();
-        let known = link.journal.records().to_vec();
-        let sent = known.len().saturating_sub(REPEATED);
-        for (i, record) in known.into_iter().enumerate() {
+        let (acknowledged, sent) = (link.journal.acknowledged(), link.journal.sent());
+        // The last that were sent may have got no further than the kernel.
+        let repeated_from = sent.wrapping_sub(REPEATED as u32);
+        // The journal keeps no more than either has room for.
+        for record in link.journal.records().to_vec() {
             link.image.publish(&record);
-            if i >= sent {
-                // The last run may have ended before it had sent them.
+            if sends && is_after(record.seq, repeated_from) {
                 let _ = link.to_send.push_back(record); // invariant: there is room
             }
             if link.settings.queue && is_after(record.seq, acknowledged) {
-                let _ = link.queue.push_back(record); // no more than fit were kept
+                let _ = link.queue.push_back(record); // invariant: there is room
             }
         }
         link.show();
@@ -165,7 +135,7 @@ impl Link {
         };
         if self.waiting.is_full() {
             // Better early than never.
-            self.publish_first();
+            self.number_first();
         }
         let _ = self.waiting.push_back((record, due_mm)); // invariant: there is room
     }
@@ -179,8 +149,9 @@ impl Link {
         now: Instant,
     ) {
         while self.waiting.front().is_some_and(|(_, due_mm)| vision.belt_travel_mm >= *due_mm) {
-            self.publish_first();
+            self.number_first();
         }
+        self.publish_saved();
         let status = &mut self.status;
         (status.vision, status.can) = (*vision, *can);
         status.can.parcels_dropped += self.unsent;
@@ -203,20 +174,47 @@ impl Link {
     /// All that is left, whatever the belt does: the input has ended.
     pub fn flush(&mut self) {
         while !self.waiting.is_empty() {
-            self.publish_first();
+            self.number_first();
         }
+        self.publish_saved();
         self.show();
     }
 
-    fn publish_first(&mut self) {
+    /// Whether nothing waits to be published or sent.
+    pub fn is_idle(&self) -> bool {
+        self.waiting.is_empty() && self.numbered.is_empty() && self.to_send.is_empty()
+    }
+
+    /// The next parcel gets its sequence number, which the journal notes before anybody sees it: it is
+    /// never given to another.
+    fn number_first(&mut self) {
         let Some((record, _)) = self.waiting.pop_front() else { return };
         let mut record = presented(record, &self.settings);
-        record.seq = match self.status.sequence.wrapping_add(1) {
-            0 => 1, // 0 is no parcel
-            next => next,
-        };
+        let last = self.numbered.back().map_or(self.status.sequence, |(last, _)| last.seq);
+        // 0 is no parcel.
+        record.seq = last.wrapping_add(1).max(1);
+        if let Err((record, _)) = self.numbered.push_back((record, self.journal.note(&record))) {
+            // The disk has not answered for so many parcels: the belt does not wait for it.
+            if let Some((first, _)) = self.numbered.pop_front() {
+                self.publish(first);
+            }
+            let noted = self.journal.saved();
+            let _ = self.numbered.push_back((record, noted)); // invariant: there is room
+        }
+        self.journal.save();
+    }
+
+    fn publish_saved(&mut self) {
+        let saved = self.journal.saved();
+        while self.numbered.front().is_some_and(|(_, noted)| *noted <= saved) {
+            if let Some((record, _)) = self.numbered.pop_front() {
+                self.publish(record);
+            }
+        }
+    }
+
+    fn publish(&mut self, record: ParcelRecord) {
         self.status.sequence = record.seq;
-        self.journal.note(&record);
         self.image.publish(&record);
         if self.settings.queue {
             if self.queue.is_full() {
@@ -224,12 +222,17 @@ impl Link {
                 self.status.queue_overflows += 1;
             }
             let _ = self.queue.push_back(record); // invariant: there is room
+        } else {
+            // A queue that is turned on later begins with what comes then.
+            self.journal.acknowledge(record.seq);
         }
-        if self.to_send.is_full() {
-            self.to_send.pop_front();
-            self.unsent += 1;
+        if self.sends {
+            if self.to_send.is_full() {
+                self.to_send.pop_front();
+                self.unsent += 1;
+            }
+            let _ = self.to_send.push_back(record); // invariant: there is room
         }
-        let _ = self.to_send.push_back(record); // invariant: there is room
     }
 
     fn show(&mut self) {
@@ -237,7 +240,6 @@ impl Link {
         self.image.set_queue_head(self.queue.front());
         self.image.set_command(&self.block);
         self.image.set_status(&self.status);
-        // Before anybody can read it: a number that was seen is never given to another parcel.
         self.journal.save();
     }
 
@@ -285,7 +287,9 @@ impl Link {
             command: registers[5],
             argument: pair(6),
         };
-        if written(1) && self.acknowledged_by(block.acknowledge).is_none() {
+        // A PLC that writes the whole block all the time may hold a number from before a restart: its
+        // heartbeat and its counts are welcome all the same.
+        if values.len() == 1 && written(1) && self.acknowledged_by(block.acknowledge).is_none() {
             return Err(Refusal::Value);
         }
         if written(0) {
@@ -380,7 +384,9 @@ impl Link {
 
     /// The next parcel to send over CAN.
     pub fn next_to_send(&mut self) -> Option<ParcelRecord> {
-        self.to_send.pop_front()
+        let record = self.to_send.pop_front()?;
+        self.journal.send(record.seq);
+        Some(record)
     }
 
     /// The next count of the encoder, and when it came.
@@ -406,7 +412,7 @@ mod tests {
     use crate::plc::registers::{LATEST, QUEUE_HEAD, RING};
 
     fn link(settings: Settings) -> Link {
-        Link::new(settings, WordOrder::HighFirst, Journal::default(), Instant::now())
+        Link::new(settings, WordOrder::HighFirst, true, Journal::default(), Instant::now())
     }
 
     fn queueing() -> Settings {
@@ -447,6 +453,44 @@ mod tests {
         assert_eq!((sequence_at(&link, QUEUE_HEAD), link.status().queued), (1, 2));
         link.command(1, 1, 9);
         assert_eq!(link.status().outcome, Outcome::Argument as u16);
+    }
+
+    #[test]
+    fn an_unknown_acknowledgment_in_a_write_of_the_whole_block_is_left_out() {
+        let mut link = link(queueing());
+        publish(&mut link, 2);
+        link.write(COMMAND, &[9, 500, 0, 77, 0, 0, 0, 0], Instant::now()).expect("taken");
+        assert_eq!((sequence_at(&link, QUEUE_HEAD), link.status().queued), (1, 2));
+        assert_eq!(link.next_count().map(|(count, _)| count), Some(77));
+    }
+
+    #[test]
+    fn a_queue_that_is_turned_on_begins_with_what_comes_then() {
+        let path = std::env::temp_dir().join(format!("beltgauge-queue-{}", std::process::id()));
+        let _ = std::fs::remove_file(&path);
+        let restarted = |settings: Settings, sends: bool| {
+            let journal = Journal::open(&path).expect("writable");
+            Link::new(settings, WordOrder::HighFirst, sends, journal, Instant::now())
+        };
+        let publish_all = |link: &mut Link, count: u32| {
+            publish(link, count);
+            while !link.numbered.is_empty() {
+                link.flush();
+            }
+        };
+        publish_all(&mut restarted(Settings::default(), false), 5);
+        let mut link = restarted(queueing(), true);
+        assert_eq!((link.status().sequence, link.status().queued), (5, 0));
+        publish_all(&mut link, 25);
+        // 20 were sent, the last 12 of them may have got lost with the controller; the others wait.
+        (0..20).for_each(|_| assert!(link.next_to_send().is_some()));
+        link.flush();
+        drop(link);
+        let mut link = restarted(queueing(), true);
+        assert_eq!((link.status().sequence, link.status().queued), (30, 25));
+        let waiting: Vec<u32> = std::iter::from_fn(|| link.next_to_send()).map(|r| r.seq).collect();
+        assert!(waiting.iter().copied().eq(9..=30), "{waiting:?}");
+        let _ = std::fs::remove_file(&path);
     }
 
     #[test]

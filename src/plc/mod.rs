@@ -1,6 +1,8 @@
 //! What the PLC gets and how: the tables, the link's state, Modbus TCP and CAN.
 
+pub mod bus;
 pub mod can;
+pub mod command;
 pub mod dbc;
 pub mod document;
 pub mod frames;

@@ -222,8 +222,13 @@ mod tests {
 
     #[test]
     fn the_map_begins_at_the_base_address_and_words_come_in_the_order_asked_for() {
-        let mut link =
-            Link::new(Plc::default(), WordOrder::LowFirst, Journal::default(), Instant::now());
+        let mut link = Link::new(
+            Plc::default(),
+            WordOrder::LowFirst,
+            false,
+            Journal::default(),
+            Instant::now(),
+        );
         let mut read =
             |address, count| answer(&mut link, 1000, Request::ReadHoldingRegisters(address, count));
         let words = vec![0x4247, MAP_VERSION, 0x5678, 0x1234];

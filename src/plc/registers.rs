@@ -83,6 +83,8 @@ pub struct CanStatus {
     pub bus_offs: u64,
     /// Parcels that no frame could be sent of in time.
     pub parcels_dropped: u64,
+    /// Frames that the interface refused for ever.
+    pub frames_refused: u64,
 }
 
 /// What the status block shows.
@@ -113,7 +115,7 @@ pub struct Status {
     pub queue_overflows: u64,
     /// Ticket of the last command, and what became of it.
     pub ticket: u16,
-    /// See [`super::link::Outcome`].
+    /// See [`super::command::Outcome`].
     pub outcome: u16,
     /// Scale interval.
     pub scale_interval_mm: f64,
@@ -124,15 +126,15 @@ pub const REASONS: [(u16, &str); 12] = [
     (0, "all is well"),
     (1, "the frame source has ended or failed"),
     (2, "no frames arrive"),
-    (3, "a table or queue has been full since start, see the counters"),
-    (4, "a parcel found the queue full and was never acknowledged"),
-    (5, "CAN: bus off"),
-    (6, "CAN: interface down or not there"),
-    (7, "CAN: error passive, nobody acknowledges"),
-    (8, "the encoder does not count"),
-    (9, "the PLC is silent"),
-    (10, "the empty belt is being learned"),
-    (11, "stopped by command"),
+    (3, "CAN: bus off"),
+    (4, "CAN: interface down or not there"),
+    (5, "CAN: error passive, nobody acknowledges"),
+    (6, "the encoder does not count"),
+    (7, "the PLC is silent"),
+    (8, "the empty belt is being learned"),
+    (9, "stopped by command"),
+    (10, "a parcel found the queue full and was never acknowledged, since start"),
+    (11, "a table or queue has been full since start, see the counters"),
 ];
 
 impl Status {
@@ -167,11 +169,10 @@ impl Status {
 
     /// Code of what matters most: see [`REASONS`].
     pub fn reason(&self) -> u16 {
+        // What was, comes after what is.
         let holds = [
             self.vision.source_ended,
             !self.running,
-            self.overflows() > 0,
-            self.queue_overflows > 0,
             self.can.state == CanState::BusOff,
             self.can.state == CanState::Down,
             self.can.state == CanState::Passive,
@@ -179,6 +180,8 @@ impl Status {
             self.plc_silent,
             !self.vision.ready,
             self.stopped,
+            self.queue_overflows > 0,
+            self.overflows() > 0,
         ];
         holds.iter().position(|holds| *holds).map_or(0, |i| i as u16 + 1)
     }
@@ -234,7 +237,7 @@ pub const STATUS_FIELDS: &[StatusField] = fields![
     [27, V1_0, "track_overflows", U32, "", 1.0, "blobs that found no free track", |s| wrapped(s.vision.counters.track_overflows)],
     [29, V1_0, "event_overflows", U32, "", 1.0, "records that found the queue to the PLC full", |s| wrapped(s.vision.counters.event_overflows)],
     [31, V1_0, "time", U32, "ms", 1.0, "time of the newest frame since start; wraps", |s| wrapped((s.vision.time_s * 1000.0) as u64)],
-    [33, V1_0, "belt_travel", U32, "mm", 10.0, "belt travel since start; wraps after 429 km", |s| s.vision.belt_travel_mm],
+    [33, V1_0, "belt_travel", U32, "mm", 10.0, "belt travel since start; wraps after 429 km", |s| wrapped_mm(s.vision.belt_travel_mm)],
     [35, V1_1, "reason", U16, "", 1.0, "what matters most, see below", |s| f64::from(s.reason())],
     [36, V1_1, "boots", U16, "", 1.0, "starts of the appliance, 0 when plc.state_file is not set; wraps", |s| f64::from(s.boots)],
     [37, V1_1, "queued", U16, "", 1.0, "parcels that wait to be acknowledged", |s| f64::from(s.queued)],
@@ -247,6 +250,7 @@ pub const STATUS_FIELDS: &[StatusField] = fields![
     [45, V1_1, "can_receive_errors", U16, "", 1.0, "error counter of the controller, when it last told", |s| f64::from(s.can.receive_errors)],
     [46, V1_1, "can_bus_offs", U32, "", 1.0, "how often the bus was lost; wraps", |s| wrapped(s.can.bus_offs)],
     [48, V1_1, "can_parcels_dropped", U32, "", 1.0, "parcels that could not be sent in time; wraps", |s| wrapped(s.can.parcels_dropped)],
+    [50, V1_1, "can_frames_refused", U32, "", 1.0, "frames that the interface refused for ever; wraps", |s| wrapped(s.can.frames_refused)],
 ];
 
 /// What a PLC writes, from [`COMMAND`] on.
@@ -259,6 +263,11 @@ pub const COMMAND_FIELDS: &[CommandField] = fields![
     [5, V1_1, "command", U16, "", 1.0, "code, see below", |c| f64::from(c.command)],
     [6, V1_1, "argument", U32, "", 1.0, "of the command", |c| f64::from(c.argument)],
 ];
+
+/// Tenths of a mm wrap at their register's size, whichever way the belt runs.
+fn wrapped_mm(mm: f64) -> f64 {
+    f64::from((10.0 * mm).round() as i64 as u32) / 10.0
+}
 
 /// Quality 0 to 100 of a dimension: 100 at sigma 0, 0 from 5 mm on.
 fn quality(sigma_mm: f64) -> f64 {
@@ -286,7 +295,7 @@ pub const PARCEL_FIELDS: &[ParcelField] = fields![
     [18, V1_0, "belt_speed", U32, "mm/s", 10.0, "mean over the pass", |p| p.belt_speed_mm_per_s],
     [20, V1_0, "frame", U32, "", 1.0, "frame at which x and y hold; wraps", |p| wrapped(p.frame)],
     [22, V1_0, "time", U32, "ms", 1.0, "time of that frame since start; wraps", |p| wrapped((p.t_s * 1000.0).round() as u64)],
-    [24, V1_0, "belt_travel", U32, "mm", 10.0, "belt travel since start at that frame", |p| p.belt_travel_mm],
+    [24, V1_0, "belt_travel", U32, "mm", 10.0, "belt travel since start at that frame; wraps after 429 km", |p| wrapped_mm(p.belt_travel_mm)],
     [30, V1_0, "sequence_end", U32, "", 1.0, "equals sequence unless the block changed between two requests", |p| f64::from(p.seq)],
 ];
 
@@ -397,6 +406,31 @@ mod tests {
             ParcelRecord { length_mm: 1e9, width_mm: -3.0, height_mm: f64::NAN, ..record(1) };
         image.publish(&huge);
         assert_eq!(image.read(LATEST + 4, 3), Some(&[65535, 0, 0][..]));
+    }
+
+    #[test]
+    fn belt_travel_wraps_and_differences_do_not() {
+        let field = PARCEL_FIELDS.iter().find(|f| f.name == "belt_travel").expect("there");
+        let bits = |mm: f64| field.bits(&ParcelRecord { belt_travel_mm: mm, ..record(1) });
+        let end_mm = f64::from(u32::MAX) / 10.0;
+        for (from, to) in [(end_mm - 50.0, end_mm + 70.0), (-3.2, 116.8), (9.7e9, 9.7e9 + 120.0)] {
+            assert_eq!(bits(to).wrapping_sub(bits(from)), 1200, "{from} to {to}");
+        }
+    }
+
+    #[test]
+    fn the_reason_is_what_is_wrong_now_before_what_was() {
+        let mut status = Status { running: true, ..Status::default() };
+        status.vision.ready = true;
+        assert_eq!(status.reason(), 0);
+        status.vision.counters.segment_overflows = 1;
+        assert_eq!(status.reason(), 11);
+        status.encoder_silent = true;
+        assert_eq!(status.reason(), 6);
+        status.can.state = CanState::BusOff;
+        assert_eq!(status.reason(), 3);
+        let codes = REASONS.iter().map(|(code, _)| *code);
+        assert!(codes.eq(0..12));
     }
 
     #[test]

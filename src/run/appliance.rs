@@ -17,8 +17,9 @@ use crate::image::{FrameTime, Plane};
 use crate::pipeline::Pipeline;
 use crate::plan::Block;
 use crate::plc::can::CanLink;
+use crate::plc::command::Request;
 use crate::plc::journal::Journal;
-use crate::plc::link::{Link, Request};
+use crate::plc::link::Link;
 use crate::plc::modbus;
 use crate::plc::registers::VisionStatus;
 use crate::source::FrameSource;
@@ -38,6 +39,8 @@ const COUNT_RING: usize = 128;
 const REQUEST_RING: usize = 16;
 /// How long a thread sleeps when a ring is empty and nobody has woken it.
 const PARK: Duration = Duration::from_millis(50);
+/// The last parcels reach disk and CAN bus within this, or not at all.
+const FAREWELL: Duration = Duration::from_secs(1);
 /// An encoder that moves faster than the belt's nominal speed by this factor was set anew.
 const ENCODER_SPEED_MAX: f64 = 5.0;
 
@@ -171,17 +174,21 @@ impl Appliance {
                 let encoder_timeout = config.encoder.mm_per_count.map(|_| config.encoder.timeout_s);
                 let encoder_timeout = encoder_timeout.map(Duration::from_secs_f64);
                 let mut can = CanLink::<CanFdSocket>::new(config.can.clone(), now);
-                let link = Link::new(config.plc.clone(), config.modbus.word_order, journal, now);
+                let sends = config.can.interface.is_some();
+                let order = config.modbus.word_order;
+                let link = Link::new(config.plc.clone(), order, sends, journal, now);
+                let mut ended_at = None;
                 modbus::serve(listener, &config.modbus, link, |link| {
                     // Asked before the ring is emptied: what came before the end is published.
                     let ended = shared.vision_ended.load(Ordering::Acquire);
                     while let Some((record, travel_mm)) = plc_out.dequeue() {
                         link.record(record, travel_mm);
                     }
+                    let now = Instant::now();
                     if ended {
                         link.flush();
+                        ended_at.get_or_insert(now);
                     }
-                    let now = Instant::now();
                     link.update(&shared.progress().status, &can.status(), encoder_timeout, now);
                     can.step(link, now);
                     // A ring that is full has enough of them: vision has not looked for long.
@@ -193,7 +200,8 @@ impl Appliance {
                     {
                         let _ = request_in.enqueue(request);
                     }
-                    !ended
+                    let all_told = link.is_idle() && can.is_idle();
+                    ended_at.is_none_or(|at| !all_told && now - at < FAREWELL)
                 })
             })?;
             while !(capture.is_finished() || vision.is_finished() || plc.is_finished()) {
