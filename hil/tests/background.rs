@@ -136,11 +136,14 @@ fn sequence(scenario: Scenario) -> (Sequence, Vec<u64>, usize) {
 
 fn theirs(
     (sequence, seen, columns): &(Sequence, Vec<u64>, usize),
-    mut apply: impl FnMut(&Mat, &mut Mat, usize),
+    rate: f64,
+    mut apply: impl FnMut(&Mat, &mut Mat, f64) -> opencv::Result<()>,
 ) -> Score {
     let (mut score, mut mask) = (Score::default(), Mat::default());
     for (n, (view, truth)) in sequence.views.iter().zip(&sequence.truth).enumerate() {
-        apply(view, &mut mask, n);
+        // The warm-up is learned at the rate that OpenCV chooses.
+        let rate = if (n as u64) < WARM_UP { -1.0 } else { rate };
+        apply(view, &mut mask, rate).expect("OpenCV");
         if n as u64 >= WARM_UP {
             // Shadows are marked 127: they are background.
             let bytes = mask.data_bytes().expect("packed");
@@ -162,9 +165,8 @@ fn mog2(sequence: &(Sequence, Vec<u64>, usize)) -> (String, Score) {
     best(settings.map(|(threshold, shadows, rate)| {
         let mut subtractor =
             video::create_background_subtractor_mog2(500, threshold, shadows).expect("MOG2");
-        let score = theirs(sequence, |view, mask, n| {
-            let rate = if (n as u64) < WARM_UP { -1.0 } else { rate };
-            BackgroundSubtractorMOG2Trait::apply(&mut subtractor, view, mask, rate).expect("MOG2");
+        let score = theirs(sequence, rate, |view, mask, rate| {
+            BackgroundSubtractorMOG2Trait::apply(&mut subtractor, view, mask, rate)
         });
         (format!("threshold {threshold}, shadows {shadows}, rate {rate}"), score)
     }))
@@ -177,9 +179,8 @@ fn mog(sequence: &(Sequence, Vec<u64>, usize)) -> (String, Score) {
     best(settings.map(|(noise, rate)| {
         let mut subtractor =
             bgsegm::create_background_subtractor_mog(200, 5, 0.7, noise).expect("MOG");
-        let score = theirs(sequence, |view, mask, n| {
-            let rate = if (n as u64) < WARM_UP { -1.0 } else { rate };
-            BackgroundSubtractorTrait::apply(&mut subtractor, view, mask, rate).expect("MOG");
+        let score = theirs(sequence, rate, |view, mask, rate| {
+            BackgroundSubtractorTrait::apply(&mut subtractor, view, mask, rate)
         });
         (format!("noise {noise}, rate {rate}"), score)
     }))
@@ -192,9 +193,8 @@ fn gmg(sequence: &(Sequence, Vec<u64>, usize)) -> (String, Score) {
     best(settings.map(|(threshold, rate)| {
         let mut subtractor =
             bgsegm::create_background_subtractor_gmg(WARM_UP as i32 - 10, threshold).expect("GMG");
-        let score = theirs(sequence, |view, mask, n| {
-            let rate = if (n as u64) < WARM_UP { -1.0 } else { rate };
-            BackgroundSubtractorTrait::apply(&mut subtractor, view, mask, rate).expect("GMG");
+        let score = theirs(sequence, rate, |view, mask, rate| {
+            BackgroundSubtractorTrait::apply(&mut subtractor, view, mask, rate)
         });
         (format!("threshold {threshold}, rate {rate}"), score)
     }))
