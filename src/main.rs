@@ -3,12 +3,13 @@
 use beltgauge::camera::LensModel;
 use beltgauge::camera::chessboard::Chessboard;
 use beltgauge::config::Site;
+use beltgauge::config::store::Store;
 use beltgauge::error::{Error, Result};
 use beltgauge::event::ParcelRecord;
 use beltgauge::run::budget::{self, StraightDown};
 use beltgauge::run::calibrate::{self, DataSheet};
-use beltgauge::run::demo;
 use beltgauge::run::offline::{self, Observer, Outputs};
+use beltgauge::run::{demo, import, live};
 use beltgauge::{run, source};
 use clap::{Parser, Subcommand};
 use std::io::{IsTerminal, Write};
@@ -23,12 +24,37 @@ use tracing_subscriber::EnvFilter;
 #[derive(Parser)]
 #[command(version)]
 struct Cli {
+    /// How the log on standard error looks; `RUST_LOG` says how much is in it.
+    #[arg(long, global = true, value_enum, default_value_t = LogFormat::Text)]
+    log: LogFormat,
     #[command(subcommand)]
     command: Command,
 }
 
+/// Formats of the log.
+#[derive(Clone, Copy, clap::ValueEnum)]
+enum LogFormat {
+    Text,
+    Json,
+}
+
 #[derive(Subcommand)]
 enum Command {
+    /// Run the appliance on a live camera, until SIGTERM.
+    Run {
+        /// Configuration file [default: the one in force in the store].
+        #[arg(long)]
+        config: Option<PathBuf>,
+        /// Folder that `import` puts configurations into.
+        #[arg(long, default_value = STORE)]
+        store: PathBuf,
+        /// Write the state to this file, every second, as JSON.
+        #[arg(long)]
+        status: Option<PathBuf>,
+        /// Feed the hardware's watchdog, for example /dev/watchdog.
+        #[arg(long)]
+        watchdog: Option<PathBuf>,
+    },
     /// Run the appliance on a synthetic belt: no camera, no PLC needed.
     Demo {
         /// How long to run.
@@ -68,11 +94,29 @@ enum Command {
     Budget(Budget),
     /// Validate a configuration and print the memory plan.
     Check {
-        /// Configuration file.
-        #[arg(long, default_value = "/etc/beltgauge/beltgauge.toml")]
-        config: PathBuf,
+        /// Configuration file [default: the one in force in the store].
+        #[arg(long)]
+        config: Option<PathBuf>,
+        /// Folder that `import` puts configurations into.
+        #[arg(long, default_value = STORE)]
+        store: PathBuf,
+    },
+    /// Do what inserting a USB stick does: put its configuration in force.
+    Import {
+        /// The stick: a folder with a folder `beltgauge` in it.
+        #[arg(required_unless_present = "roll_back")]
+        dir: Option<PathBuf>,
+        /// Go back to the configuration before the one in force.
+        #[arg(long, conflicts_with = "dir")]
+        roll_back: bool,
+        /// Folder to put configurations into.
+        #[arg(long, default_value = STORE)]
+        store: PathBuf,
     },
 }
+
+/// Where an appliance keeps its configurations.
+const STORE: &str = "/var/lib/beltgauge";
 
 #[derive(clap::Args)]
 struct Budget {
@@ -206,15 +250,26 @@ fn thickness(text: &str) -> std::result::Result<f64, String> {
 }
 
 fn main() -> ExitCode {
-    // Logs go beside the results, on standard error: RUST_LOG=beltgauge=debug shows more.
-    let filter = EnvFilter::builder().with_default_directive(Level::WARN.into()).from_env_lossy();
-    tracing_subscriber::fmt().with_env_filter(filter).with_writer(std::io::stderr).init();
-    match dispatch(Cli::parse().command) {
+    let cli = Cli::parse();
+    start_log(&cli);
+    match dispatch(cli.command) {
         Ok(()) => ExitCode::SUCCESS,
         Err(error) => {
             let _ = writeln!(std::io::stderr(), "error: {error}");
             ExitCode::from(error.exit_status())
         }
+    }
+}
+
+/// Logs go beside the results, on standard error: `RUST_LOG=beltgauge=debug` shows more.
+fn start_log(cli: &Cli) {
+    // An appliance's log is all that it leaves; a tool's results speak for themselves.
+    let level = if matches!(cli.command, Command::Run { .. }) { Level::INFO } else { Level::WARN };
+    let filter = EnvFilter::builder().with_default_directive(level.into()).from_env_lossy();
+    let log = tracing_subscriber::fmt().with_env_filter(filter).with_writer(std::io::stderr);
+    match cli.log {
+        LogFormat::Text => log.init(),
+        LogFormat::Json => log.json().init(),
     }
 }
 
@@ -260,8 +315,22 @@ fn dispatch(command: Command) -> Result<()> {
         }
         Command::Calibrate(what) => calibrate(what),
         Command::Budget(what) => print_budget(&what),
-        Command::Check { config } => {
-            let site = Site::load(&config)?;
+        Command::Run { config, store, status, watchdog } => live::run(&live::Options {
+            config: config.as_deref(),
+            store: &store,
+            status: status.as_deref(),
+            watchdog: watchdog.as_deref(),
+        }),
+        Command::Import { dir, store, .. } => {
+            let store = Store::new(&store);
+            let report = match dir {
+                Some(dir) => import::import(&dir, &store)?,
+                None => import::roll_back(&store)?,
+            };
+            print(format_args!("{}", report.trim_end()))
+        }
+        Command::Check { config, store } => {
+            let site = Site::load(&config.unwrap_or_else(|| Store::new(&store).config()))?;
             let plan = run::plan(&site);
             print(format_args!("{plan}"))?;
             plan.check_limit(site.config.limits.memory_mib_max)?;

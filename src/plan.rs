@@ -169,6 +169,7 @@ impl Memory {
             // SAFETY: parts * part = count, so every part lies inside the entry's range.
             start: unsafe { start.add(i * part) },
             count: part,
+            foreign: false,
             _mapping: Arc::clone(&self.mapping),
         };
         Ok((0..parts).map(block).collect())
@@ -187,6 +188,7 @@ impl Memory {
 pub struct Block<T> {
     start: *mut T,
     count: usize,
+    foreign: bool,
     _mapping: Arc<Mapping>,
 }
 
@@ -195,10 +197,36 @@ unsafe impl<T: Send> Send for Block<T> {}
 // SAFETY: `&Block` gives `&[T]` only.
 unsafe impl<T: Sync> Sync for Block<T> {}
 
+impl Block<u8> {
+    /// A mapping of its own, filled with zeros: a device's buffers come and go with the device.
+    pub fn own(bytes: usize) -> Result<Self> {
+        let mapping = memmap2::MmapMut::map_anon(bytes.max(1))
+            .map_err(|e| Error::failure(format!("cannot map {bytes} bytes: {e}")))?;
+        Ok(Self { foreign: false, ..Self::over(mapping.into(), bytes) })
+    }
+
+    /// The first `bytes` of a mapping, at most all of it; a driver's frame buffer, for one. Whoever
+    /// gives the driver the buffer back must give up this block's contents first.
+    pub fn over(mapping: memmap2::MmapRaw, bytes: usize) -> Self {
+        Self {
+            start: mapping.as_mut_ptr(),
+            count: bytes.min(mapping.len()),
+            foreign: true,
+            _mapping: Arc::new(Mapping(mapping)),
+        }
+    }
+
+    /// Whether it is memory of a driver's.
+    pub fn is_foreign(&self) -> bool {
+        self.foreign
+    }
+}
+
 impl<T> Deref for Block<T> {
     type Target = [T];
     fn deref(&self) -> &[T] {
-        // SAFETY: `take` wrote all `count` elements; T is Copy, so they stay valid.
+        // SAFETY: `take` wrote all `count` elements, or they are bytes of a mapping; T is Copy, so
+        // they stay valid.
         unsafe { std::slice::from_raw_parts(self.start, self.count) }
     }
 }

@@ -4,9 +4,9 @@
 use beltgauge::config::{Config, Site};
 use beltgauge::error::Result;
 use beltgauge::image::FrameTime;
-use beltgauge::run::{Appliance, Pace, demo};
-use beltgauge::source::FrameSource;
+use beltgauge::run::{Appliance, demo};
 use beltgauge::source::synthetic::{Scenario, Synthetic};
+use beltgauge::source::{FrameSource, Pace, Paced};
 use std::alloc::{GlobalAlloc, Layout, System};
 use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
 
@@ -109,8 +109,8 @@ fn run(source: &mut Watched, mut site: Site, workers: usize) -> (u64, u64, u64) 
     VISION.store(0, Ordering::Relaxed);
     site.config.realtime.workers = workers;
     site.config.modbus.listen = ([127, 0, 0, 1], 0).into();
-    let appliance = Appliance::new(site, Pace::Source).expect("port 0 is free");
-    let progress = appliance.run(source, |_, records| {
+    let appliance = Appliance::new(site).expect("port 0 is free");
+    let progress = appliance.run(&mut Paced::new(source, Pace::Unhurried), |_, records| {
         records.for_each(drop);
         true
     });

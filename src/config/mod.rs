@@ -2,10 +2,12 @@
 //! unknown keys are refused; a wrong value names file, key, value, allowed range and remedy.
 
 mod schema;
+pub mod stick;
+pub mod store;
 
 pub use schema::{
-    Background, Can, Config, DimensionOrder, Encoder, Limits, Measure, Modbus, Odometry, Plc,
-    Realtime, Segment, View, WordOrder,
+    Background, CameraTable, Can, Config, DimensionOrder, Encoder, Import, Interface, Limits,
+    Measure, Modbus, Odometry, Plc, Realtime, Segment, View, WordOrder,
 };
 
 use crate::camera::{BeltView, Camera, CameraFile};

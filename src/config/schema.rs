@@ -1,5 +1,6 @@
 //! The keys of the configuration file, their defaults and ranges.
 
+use super::stick::public_key;
 use crate::error::{Error, Result};
 use crate::units::BeltRect;
 use serde::Deserialize;
@@ -49,6 +50,22 @@ pub struct Config {
     /// `[encoder]`
     #[serde(default)]
     pub encoder: Encoder,
+    /// `[import]`
+    #[serde(default)]
+    pub import: Import,
+}
+
+/// How a live camera is reached.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Deserialize)]
+#[serde(rename_all = "lowercase")]
+pub enum Interface {
+    /// Video4Linux: USB webcams and industrial cameras with a kernel driver.
+    #[default]
+    V4l2,
+    /// GigE cameras, by this program's own receiver.
+    Gige,
+    /// GigE and USB3 cameras, by the Aravis library; needs the cargo feature `aravis`.
+    Aravis,
 }
 
 /// `[camera]`: where the pictures come from and how they were taken.
@@ -57,6 +74,61 @@ pub struct Config {
 pub struct CameraTable {
     /// Calibration file, relative to the configuration file.
     pub calibration: PathBuf,
+    /// How the camera is reached.
+    #[serde(default)]
+    pub interface: Interface,
+    /// Which one: device path, bus or card name; address, serial number or name of a GigE camera.
+    /// None given: the only one.
+    pub device: Option<String>,
+    /// Pixel format, by its V4L2 or GenICam name; none given: 8-bit mono.
+    pub format: Option<String>,
+    /// Frames a second; none given: what the camera is set to.
+    pub fps: Option<f64>,
+    /// Exposure; none given: what the camera is set to.
+    pub exposure_us: Option<f64>,
+    /// Gain, in the camera's own unit; none given: what the camera is set to.
+    pub gain: Option<f64>,
+    /// GigE packets, headers included; none given: 1500 bytes.
+    pub packet_bytes: Option<u32>,
+    /// Other controls by the driver's or GenICam's name, set in this order, trigger for one.
+    #[serde(default)]
+    pub controls: toml::Table,
+}
+
+impl CameraTable {
+    /// All defaults.
+    pub fn new(calibration: PathBuf) -> Self {
+        Self {
+            calibration,
+            interface: Interface::default(),
+            device: None,
+            format: None,
+            fps: None,
+            exposure_us: None,
+            gain: None,
+            packet_bytes: None,
+            controls: toml::Table::new(),
+        }
+    }
+
+    fn check(&self) -> Result<()> {
+        for (key, value, min, max, unit) in [
+            ("camera.fps", self.fps, 0.5, 1000.0, "frames a second"),
+            ("camera.exposure_us", self.exposure_us, 1.0, 1e6, "us"),
+            ("camera.gain", self.gain, 0.0, 1e6, ""),
+            ("camera.packet_bytes", self.packet_bytes.map(f64::from), 576.0, 9000.0, "bytes"),
+        ] {
+            value.map_or(Ok(()), |value| range(key, value, min, max, unit))?;
+        }
+        for (name, value) in &self.controls {
+            if value.is_table() || value.is_array() || value.is_datetime() {
+                return Err(Error::configuration(format!("camera.controls.{name} = {value}"))
+                    .allowed("a number, true, false or a text")
+                    .remedy("write one value for each control"));
+            }
+        }
+        Ok(())
+    }
 }
 
 /// `[belt]`
@@ -325,6 +397,14 @@ impl Default for Encoder {
     }
 }
 
+/// `[import]`: what a USB stick may change.
+#[derive(Clone, Debug, Default, PartialEq, Eq, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct Import {
+    /// Only files signed with the secret key that belongs to this one (minisign) are accepted.
+    pub public_key: Option<String>,
+}
+
 impl Config {
     /// Parse and check each key on its own.
     pub fn parse(text: &str) -> Result<Self> {
@@ -339,7 +419,7 @@ impl Config {
 
     fn check(&self) -> Result<()> {
         let Self {
-            camera: _,
+            camera,
             zone,
             belt,
             view,
@@ -353,7 +433,9 @@ impl Config {
             modbus,
             can,
             encoder,
+            import,
         } = self;
+        camera.check()?;
         for (key, mm) in [
             ("zone.x_min_mm", zone.x_min_mm),
             ("zone.x_max_mm", zone.x_max_mm),
@@ -410,7 +492,8 @@ impl Config {
         count("modbus.idle_timeout_s", modbus.idle_timeout_s as usize, 1, 86_400)?;
         count("modbus.base_address", usize::from(modbus.base_address), 0, 60_000)?;
         can.check()?;
-        encoder.check()
+        encoder.check()?;
+        import.public_key.as_deref().map_or(Ok(()), |key| public_key(key).map(drop))
     }
 }
 

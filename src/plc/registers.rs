@@ -11,8 +11,9 @@ use crate::event::{Counters, ParcelRecord, Shape};
 /// Versions of the map, major in the high byte; a client checks the major one.
 const V1_0: u16 = 0x0100;
 const V1_1: u16 = 0x0101;
+const V1_2: u16 = 0x0102;
 /// The current one.
-pub const MAP_VERSION: u16 = V1_1;
+pub const MAP_VERSION: u16 = V1_2;
 /// Address of the registers that a PLC writes, and their number.
 pub const COMMAND: u16 = 60;
 /// Registers that a PLC writes.
@@ -30,7 +31,19 @@ pub const RING_PARCELS: u16 = 32;
 /// Registers in all.
 pub const COUNT: u16 = RING + RING_PARCELS * PARCEL_STRIDE;
 
-/// What the vision thread tells.
+/// The code of an import that was refused.
+pub const IMPORT_REFUSED: u16 = 2;
+
+/// What became of the last configuration that was imported.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub struct ImportStatus {
+    /// Imports tried since the store was made.
+    pub count: u16,
+    /// 0 none was tried, 1 applied, 2 refused, 3 rolled back.
+    pub result: u16,
+}
+
+/// What the appliance's other threads tell.
 #[derive(Clone, Copy, Debug, Default)]
 #[allow(clippy::struct_excessive_bools)] // they become bits
 pub struct VisionStatus {
@@ -50,6 +63,16 @@ pub struct VisionStatus {
     pub belt_travel_mm: f64,
     /// Frames that came too late and were dropped.
     pub frames_dropped: u64,
+    /// Frames that the camera counted and that never came.
+    pub frames_lost: u64,
+    /// Frames that came with parts missing.
+    pub frames_torn: u64,
+    /// There is no camera, or it does not do what the configuration asks for.
+    pub camera_absent: bool,
+    /// How often the camera was lost.
+    pub camera_losses: u64,
+    /// Of the last configuration that came on a stick.
+    pub import: ImportStatus,
     /// What the pipeline counts.
     pub counters: Counters,
 }
@@ -121,8 +144,8 @@ pub struct Status {
     pub scale_interval_mm: f64,
 }
 
-/// What is wrong or worth knowing, most important first: code and meaning.
-pub const REASONS: [(u16, &str); 12] = [
+/// What is wrong or worth knowing: code and meaning.
+pub const REASONS: [(u16, &str); 14] = [
     (0, "all is well"),
     (1, "the frame source has ended or failed"),
     (2, "no frames arrive"),
@@ -135,6 +158,8 @@ pub const REASONS: [(u16, &str); 12] = [
     (9, "stopped by command"),
     (10, "a parcel found the queue full and was never acknowledged, since start"),
     (11, "a table or queue has been full since start, see the counters"),
+    (12, "the camera is not there, or does not do what the configuration asks for: see the log"),
+    (13, "the last configuration that was imported was refused: see its report"),
 ];
 
 impl Status {
@@ -164,26 +189,29 @@ impl Status {
             self.queue_overflows > 0,
             matches!(self.can.state, CanState::BusOff | CanState::Down),
             self.encoder_silent,
+            self.vision.camera_absent,
         ])
     }
 
     /// Code of what matters most: see [`REASONS`].
     pub fn reason(&self) -> u16 {
-        // What was, comes after what is.
+        // Most important first; what was, comes after what is.
         let holds = [
-            self.vision.source_ended,
-            !self.running,
-            self.can.state == CanState::BusOff,
-            self.can.state == CanState::Down,
-            self.can.state == CanState::Passive,
-            self.encoder_silent,
-            self.plc_silent,
-            !self.vision.ready,
-            self.stopped,
-            self.queue_overflows > 0,
-            self.overflows() > 0,
+            (1, self.vision.source_ended),
+            (12, self.vision.camera_absent),
+            (2, !self.running),
+            (3, self.can.state == CanState::BusOff),
+            (4, self.can.state == CanState::Down),
+            (5, self.can.state == CanState::Passive),
+            (6, self.encoder_silent),
+            (7, self.plc_silent),
+            (8, !self.vision.ready),
+            (9, self.stopped),
+            (13, self.vision.import.result == IMPORT_REFUSED),
+            (10, self.queue_overflows > 0),
+            (11, self.overflows() > 0),
         ];
-        holds.iter().position(|holds| *holds).map_or(0, |i| i as u16 + 1)
+        holds.iter().find(|(_, holds)| *holds).map_or(0, |(code, _)| *code)
     }
 }
 
@@ -226,7 +254,7 @@ pub const STATUS_FIELDS: &[StatusField] = fields![
     [4, V1_0, "test_i16", I16, "", 1.0, "constant -12345: checks the sign", |_| -12345.0],
     [10, V1_0, "heartbeat", U16, "", 1.0, "rises ten times a second while frames arrive; wraps", |s| f64::from(s.heartbeat)],
     [11, V1_0, "status", U16, "bits", 1.0, "bit 0 running, bit 1 ready (belt learned), bit 2 belt motion measured, bit 3 by the encoder, bit 4 stopped by command, bit 5 PLC silent, bit 6 parcels wait to be acknowledged", |s| f64::from(s.status_bits())],
-    [12, V1_0, "fault", U16, "bits", 1.0, "bit 0 frame source ended, bit 1 a table has been full since start (see counters), bit 2 a parcel was never acknowledged, bit 3 CAN bus off or down, bit 4 encoder silent", |s| f64::from(s.fault_bits())],
+    [12, V1_0, "fault", U16, "bits", 1.0, "bit 0 frame source ended, bit 1 a table has been full since start (see counters), bit 2 a parcel was never acknowledged, bit 3 CAN bus off or down, bit 4 encoder silent, bit 5 no camera", |s| f64::from(s.fault_bits())],
     [13, V1_0, "belt_speed", U32, "mm/s", 10.0, "belt speed", |s| s.vision.belt_speed_mm_per_s],
     [15, V1_0, "frames", U32, "", 1.0, "frames processed; wraps", |s| wrapped(s.vision.counters.frames)],
     [17, V1_0, "frames_dropped", U32, "", 1.0, "frames that came too late; wraps", |s| wrapped(s.vision.frames_dropped)],
@@ -251,6 +279,11 @@ pub const STATUS_FIELDS: &[StatusField] = fields![
     [46, V1_1, "can_bus_offs", U32, "", 1.0, "how often the bus was lost; wraps", |s| wrapped(s.can.bus_offs)],
     [48, V1_1, "can_parcels_dropped", U32, "", 1.0, "parcels that could not be sent in time; wraps", |s| wrapped(s.can.parcels_dropped)],
     [50, V1_1, "can_frames_refused", U32, "", 1.0, "frames that the interface refused for ever; wraps", |s| wrapped(s.can.frames_refused)],
+    [52, V1_2, "frames_lost", U32, "", 1.0, "frames that the camera counted and that never came; wraps", |s| wrapped(s.vision.frames_lost)],
+    [54, V1_2, "frames_torn", U32, "", 1.0, "frames that came with parts missing; wraps", |s| wrapped(s.vision.frames_torn)],
+    [56, V1_2, "camera_losses", U16, "", 1.0, "how often the camera was lost; wraps", |s| f64::from(s.vision.camera_losses as u16)],
+    [57, V1_2, "imports", U16, "", 1.0, "configurations that came on a stick; wraps", |s| f64::from(s.vision.import.count)],
+    [58, V1_2, "import_result", U16, "", 1.0, "of the last: 0 there was none, 1 applied, 2 refused, 3 rolled back", |s| f64::from(s.vision.import.result)],
 ];
 
 /// What a PLC writes, from [`COMMAND`] on.
@@ -430,7 +463,7 @@ mod tests {
         status.can.state = CanState::BusOff;
         assert_eq!(status.reason(), 3);
         let codes = REASONS.iter().map(|(code, _)| *code);
-        assert!(codes.eq(0..12));
+        assert!(codes.eq(0..14));
     }
 
     #[test]

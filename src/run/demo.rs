@@ -1,12 +1,12 @@
 //! `beltgauge demo`: the appliance in real time on the synthetic belt, and the truth beside it.
 
 use super::annotate::draw;
-use super::{Appliance, Pace, Progress};
+use super::{Appliance, Progress};
 use crate::config::{Config, Site};
 use crate::error::{Error, Result};
 use crate::event::ParcelRecord;
-use crate::source::FrameSource;
 use crate::source::synthetic::{Parcel, Scenario, Synthetic};
+use crate::source::{FrameSource, Pace, Paced};
 use std::fmt::Write as _;
 use std::io::Write as _;
 use std::net::SocketAddr;
@@ -87,17 +87,18 @@ pub fn run(options: Options<'_>) -> Result<String> {
         "rendering the belt; Modbus TCP on {listen}, registers as in config/REGISTERS.md"
     );
     let mut source = Synthetic::new(scenario)?;
-    let appliance = Appliance::new(site, Pace::RealTime)?;
+    let appliance = Appliance::new(site)?;
     let mut records: Vec<ParcelRecord> = Vec::new();
     let (start, mut shown) = (Instant::now(), Instant::now());
-    let progress = appliance.run(&mut source, |progress, new| {
-        records.extend(new);
-        if shown.elapsed() >= CONSOLE_PERIOD {
-            shown = Instant::now();
-            console(progress, start.elapsed(), records.last());
-        }
-        start.elapsed().as_secs_f64() < options.seconds
-    })?;
+    let progress =
+        appliance.run(&mut Paced::new(&mut source, Pace::RealTime), |progress, new| {
+            records.extend(new);
+            if shown.elapsed() >= CONSOLE_PERIOD {
+                shown = Instant::now();
+                console(progress, start.elapsed(), records.last());
+            }
+            start.elapsed().as_secs_f64() < options.seconds
+        })?;
     let _ = writeln!(std::io::stderr());
     let mut lines = Vec::new();
     for record in &records {

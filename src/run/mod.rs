@@ -6,11 +6,15 @@ mod appliance;
 pub mod budget;
 pub mod calibrate;
 pub mod demo;
+pub mod import;
+pub mod live;
 mod memory;
 pub mod offline;
 mod realtime;
 mod report;
+mod watchdog;
 
 pub use annotate::Annotator;
-pub use appliance::{Appliance, Pace, Progress};
+pub use appliance::{Appliance, ImportBoard, Progress};
 pub use memory::{build, plan};
+pub use watchdog::Watchdog;

@@ -1,14 +1,23 @@
-//! Where frames come from: files, a directory, or the synthetic belt.
+//! Where frames come from: files, a directory, the synthetic belt, or a live camera.
 
+#[cfg(feature = "aravis")]
+mod aravis;
 mod directory;
+mod feed;
+mod gige;
+mod pixels;
 mod still;
 pub mod synthetic;
+#[cfg(feature = "v4l2")]
+mod v4l2;
 mod y4m;
 
 pub use directory::Directory;
+pub use feed::{Arrival, Driver, Feed, FeedStatus, Live, Next, Pace, Paced, Taken};
 pub use still::{Still, stills_in};
 pub use y4m::Y4m;
 
+use crate::config::{CameraTable, Interface};
 use crate::error::{Error, Result};
 use crate::image::FrameTime;
 use std::path::Path;
@@ -30,6 +39,20 @@ pub trait FrameSource: Send {
     /// The next `count` frames were not taken in time: leave them out. A camera does so by
     /// itself.
     fn skip(&mut self, _count: u64) {}
+}
+
+/// Open the camera of a configuration for frames of a size.
+pub fn open_camera(settings: &CameraTable, size_px: [usize; 2]) -> Result<Box<dyn Driver>> {
+    match settings.interface {
+        #[cfg(feature = "v4l2")]
+        Interface::V4l2 => Ok(Box::new(v4l2::V4l2::open(settings, size_px)?)),
+        Interface::Gige => Ok(Box::new(gige::Gige::open(settings, size_px)?)),
+        #[cfg(feature = "aravis")]
+        Interface::Aravis => Ok(Box::new(aravis::Aravis::open(settings, size_px)?)),
+        #[allow(unreachable_patterns)] // with every feature there is none left
+        _ => Err(Error::configuration("camera.interface: this program was built without it")
+            .remedy("choose another interface, or build with the cargo feature of its name")),
+    }
 }
 
 /// Open a replay: a Y4M file, `-` for Y4M on standard input, or a directory of images.

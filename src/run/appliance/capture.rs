@@ -1,0 +1,80 @@
+//! The capture thread: frames from the feed into the ring, as long as there are buffers.
+
+use super::{Frame, Shared};
+use crate::error::Result;
+use crate::plan::Block;
+use crate::source::{Feed, Next};
+use heapless::spsc::{Consumer, Producer};
+use std::sync::atomic::{AtomicU64, Ordering};
+
+/// The capture thread.
+pub(super) struct Capture<'a> {
+    feed: &'a mut dyn Feed,
+    free: Consumer<'a, Block<u8>>,
+    ready: Producer<'a, Frame>,
+    shared: &'a Shared,
+    /// A buffer that nothing was put into.
+    empty: Option<Block<u8>>,
+    /// Index of the newest frame.
+    newest: Option<u64>,
+    /// Frames that were let go since then, for want of a buffer.
+    let_go: u64,
+}
+
+impl<'a> Capture<'a> {
+    pub(super) fn new(
+        feed: &'a mut dyn Feed,
+        free: Consumer<'a, Block<u8>>,
+        ready: Producer<'a, Frame>,
+        shared: &'a Shared,
+    ) -> Self {
+        Self { feed, free, ready, shared, empty: None, newest: None, let_go: 0 }
+    }
+
+    pub(super) fn run(mut self) -> Result<()> {
+        let result = self.frames();
+        self.shared.source_ended.store(true, Ordering::Release);
+        self.shared.wake_vision();
+        result
+    }
+
+    fn frames(&mut self) -> Result<()> {
+        let add = |counter: &AtomicU64, count: u64| counter.fetch_add(count, Ordering::Relaxed);
+        while !self.shared.stopped() {
+            self.shared.beats.capture.beat();
+            let Some(mut pixels) = self.empty.take().or_else(|| self.free.dequeue()) else {
+                let count = self.feed.skip()?;
+                self.let_go += count;
+                add(&self.shared.frames_dropped, count);
+                continue;
+            };
+            let late = self.feed.status().late;
+            let next = self.feed.next(&mut pixels)?;
+            // Never waits: whoever reads it sees the state before.
+            if let Ok(mut status) = self.shared.feed.try_lock() {
+                *status = self.feed.status();
+            }
+            match next {
+                Next::Frame(taken) => {
+                    self.let_go += self.feed.status().late - late;
+                    let expected = self.newest.map_or(taken.time.index, |newest| newest + 1);
+                    let missing = taken.time.index.saturating_sub(expected);
+                    add(&self.shared.frames_lost, missing.saturating_sub(self.let_go));
+                    (self.newest, self.let_go) = (Some(taken.time.index), 0);
+                    // There are no more frames than places in the ring.
+                    let _ = self.ready.enqueue(Frame { pixels, taken });
+                    self.shared.wake_vision();
+                }
+                Next::Torn => {
+                    // It is missing in the count of frames, but not lost on the way.
+                    self.let_go += 1;
+                    add(&self.shared.frames_torn, 1);
+                    self.empty = Some(pixels);
+                }
+                Next::Nothing => self.empty = Some(pixels),
+                Next::End => return Ok(()),
+            }
+        }
+        Ok(())
+    }
+}

@@ -1,0 +1,131 @@
+//! `beltgauge run`: the appliance on a live camera, until it is told to stop.
+
+use super::{Appliance, Progress, Watchdog};
+use crate::config::Site;
+use crate::config::store::{ImportRecord, Store};
+use crate::error::{Error, Result};
+use crate::event::ParcelRecord;
+use crate::plc::registers::ImportStatus;
+use crate::source::{Live, open_camera};
+use serde::Serialize;
+use signal_hook::consts::{SIGINT, SIGTERM};
+use std::path::{Path, PathBuf};
+use std::sync::Arc;
+use std::sync::atomic::{AtomicBool, Ordering};
+use std::time::{Duration, Instant};
+
+/// Status file and imports are looked after this often.
+const HOUSEKEEPING: Duration = Duration::from_secs(1);
+
+/// What to run.
+#[derive(Clone, Debug)]
+pub struct Options<'a> {
+    /// Configuration file; none given: the one in force in the store.
+    pub config: Option<&'a Path>,
+    /// Store of configurations.
+    pub store: &'a Path,
+    /// File to write the state to, every second.
+    pub status: Option<&'a Path>,
+    /// The hardware's watchdog.
+    pub watchdog: Option<&'a Path>,
+}
+
+/// Run until SIGTERM or SIGINT; parcels that are inside then are lost.
+pub fn run(options: &Options<'_>) -> Result<()> {
+    let stop = Arc::new(AtomicBool::new(false));
+    for signal in [SIGTERM, SIGINT] {
+        signal_hook::flag::register(signal, Arc::clone(&stop))
+            .map_err(|e| Error::failure(format!("cannot wait for signals: {e}")))?;
+    }
+    let store = Store::new(options.store);
+    let mut site = Site::load(options.config.unwrap_or(&store.config()))?;
+    if options.config.is_none() {
+        site.config.plc.state_file.get_or_insert_with(|| store.plc_state());
+    }
+    let camera = site.config.camera.clone();
+    let mut feed = Live::new(camera, site.camera.image_size_px, open_camera);
+    let listen = site.config.modbus.listen;
+    let watchdog = Watchdog::new(options.watchdog)?;
+    let (appliance, imports) = Appliance::new(site)?.supervised(watchdog);
+    tracing::info!("measuring; Modbus TCP on {listen}");
+    let mut kept_at: Option<Instant> = None;
+    let progress = appliance.run(&mut feed, |progress, records| {
+        records.for_each(|record| log(&record));
+        if kept_at.is_none_or(|at| at.elapsed() >= HOUSEKEEPING) {
+            kept_at = Some(Instant::now());
+            let ImportRecord { count, result } = store.last_import();
+            let status = ImportStatus { count, result: result as u16 };
+            *imports.lock().unwrap_or_else(std::sync::PoisonError::into_inner) = status;
+            if let Some(path) = options.status {
+                write_status(path, progress);
+            }
+        }
+        !stop.load(Ordering::Relaxed)
+    })?;
+    tracing::info!("stopped; {}", progress.status.counters);
+    Ok(())
+}
+
+fn log(record: &ParcelRecord) {
+    tracing::info!(
+        seq = record.seq,
+        length_mm = record.length_mm,
+        width_mm = record.width_mm,
+        height_mm = record.height_mm,
+        flags = %record.flags,
+        "parcel"
+    );
+}
+
+/// The status file.
+#[derive(Serialize)]
+struct StatusFile {
+    version: &'static str,
+    ready: bool,
+    camera_absent: bool,
+    camera_losses: u64,
+    frames: u64,
+    frames_dropped: u64,
+    frames_lost: u64,
+    frames_torn: u64,
+    parcels: u64,
+    belt_speed_mm_per_s: f64,
+    belt_measured: bool,
+    time_s: f64,
+    frame_time_max_ms: f64,
+    imports: u16,
+    import_result: u16,
+}
+
+/// Written beside and renamed, so that a reader sees all of it. One that cannot be written is no
+/// reason to stop measuring.
+fn write_status(path: &Path, progress: &Progress) {
+    let status = &progress.status;
+    let file = StatusFile {
+        version: env!("CARGO_PKG_VERSION"),
+        ready: status.ready,
+        camera_absent: status.camera_absent,
+        camera_losses: status.camera_losses,
+        frames: status.counters.frames,
+        frames_dropped: status.frames_dropped,
+        frames_lost: status.frames_lost,
+        frames_torn: status.frames_torn,
+        parcels: status.counters.parcels,
+        belt_speed_mm_per_s: status.belt_speed_mm_per_s,
+        belt_measured: status.belt_measured,
+        time_s: status.time_s,
+        frame_time_max_ms: progress.frame_time_max.as_secs_f64() * 1e3,
+        imports: status.import.count,
+        import_result: status.import.result,
+    };
+    let mut new = path.as_os_str().to_owned();
+    new.push(".new");
+    let new = PathBuf::from(new);
+    let written = serde_json::to_vec(&file)
+        .map_err(std::io::Error::from)
+        .and_then(|bytes| std::fs::write(&new, bytes))
+        .and_then(|()| std::fs::rename(&new, path));
+    if let Err(e) = written {
+        tracing::warn!("the status file {} cannot be written: {e}", path.display());
+    }
+}

@@ -1,0 +1,420 @@
+//! What the capture thread takes frames from: a recording at its own pace, or a live camera that is
+//! opened again when it was lost.
+
+use super::FrameSource;
+use crate::config::CameraTable;
+use crate::error::{Error, Result};
+use crate::image::FrameTime;
+use crate::plan::Block;
+use std::time::{Duration, Instant};
+
+/// A lost camera is looked for this often.
+const RETRY: Duration = Duration::from_secs(1);
+/// A camera's clock that runs away from ours by more than this was set.
+const CLOCK_JUMP_S: f64 = 1.0;
+
+/// A camera whose numbers jump by more began to count anew.
+const FRAMES_LOST_MAX: u64 = 100_000;
+
+/// A frame's circumstances; its pixels are in the buffer that was exchanged.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Taken {
+    /// Index and time since the first frame.
+    pub time: FrameTime,
+    /// When it was exposed, by this machine's clock.
+    pub captured: Instant,
+    /// Bytes from one row to the next.
+    pub stride: usize,
+}
+
+/// What there was when a frame was asked for.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub enum Next {
+    /// A frame.
+    Frame(Taken),
+    /// A frame with parts missing; the buffer's contents are of no use.
+    Torn,
+    /// Nothing for a while, or no camera: ask again.
+    Nothing,
+    /// There will be no more.
+    End,
+}
+
+/// How a feed fares.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub struct FeedStatus {
+    /// There is no camera, or it does not do what the configuration asks for.
+    pub absent: bool,
+    /// How often a camera was lost after it had been there.
+    pub losses: u64,
+    /// Frames that were left out because they came too late.
+    pub late: u64,
+    /// Parts of frames that were asked for again.
+    pub resends: u64,
+}
+
+/// What the capture thread takes frames from.
+pub trait Feed: Send {
+    /// Width and height of every frame.
+    fn size_px(&self) -> [usize; 2];
+
+    /// Exchange an empty buffer for one with the next frame, waiting for it a fraction of a
+    /// second. The buffer that comes back may be another one.
+    fn next(&mut self, buffer: &mut Block<u8>) -> Result<Next>;
+
+    /// There is no buffer: let the next frame go by, and say how many went.
+    fn skip(&mut self) -> Result<u64>;
+
+    /// How it fares.
+    fn status(&self) -> FeedStatus;
+}
+
+/// When the frames of a recording are taken.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Pace {
+    /// As soon as there is a buffer for one.
+    Unhurried,
+    /// At the recording's frame rate by the clock; a frame that is late is left out.
+    RealTime,
+}
+
+/// A recording, or the synthetic belt, in place of a camera.
+pub struct Paced<'a> {
+    source: &'a mut dyn FrameSource,
+    pace: Pace,
+    start: Option<Instant>,
+    taken: u64,
+    late: u64,
+}
+
+impl<'a> Paced<'a> {
+    /// Frames of `source` at a pace.
+    pub fn new(source: &'a mut dyn FrameSource, pace: Pace) -> Self {
+        Self { source, pace, start: None, taken: 0, late: 0 }
+    }
+
+    fn due(&mut self) -> Instant {
+        let start = *self.start.get_or_insert_with(Instant::now);
+        start + Duration::from_secs_f64(self.taken as f64 / self.source.fps())
+    }
+
+    /// Sleep until the next frame is due; leave out those that are over already.
+    fn wait(&mut self) {
+        let (due, now) = (self.due(), Instant::now());
+        std::thread::sleep(due.saturating_duration_since(now));
+        let late = (now.saturating_duration_since(due).as_secs_f64() * self.source.fps()) as u64;
+        if late > 0 {
+            self.source.skip(late);
+            self.taken += late;
+            self.late += late;
+        }
+    }
+}
+
+impl Feed for Paced<'_> {
+    fn size_px(&self) -> [usize; 2] {
+        self.source.size_px()
+    }
+
+    fn next(&mut self, buffer: &mut Block<u8>) -> Result<Next> {
+        if self.pace == Pace::RealTime {
+            self.wait();
+        }
+        let due = self.due();
+        let Some(time) = self.source.next_into(buffer)? else { return Ok(Next::End) };
+        self.taken += 1;
+        let captured = if self.pace == Pace::RealTime { due } else { Instant::now() };
+        Ok(Next::Frame(Taken { time, captured, stride: self.source.size_px()[0] }))
+    }
+
+    fn skip(&mut self) -> Result<u64> {
+        if self.pace == Pace::RealTime {
+            self.wait();
+            self.source.skip(1);
+            self.taken += 1;
+            return Ok(1);
+        }
+        std::thread::sleep(Duration::from_secs_f64(1.0 / self.source.fps()));
+        Ok(0)
+    }
+
+    fn status(&self) -> FeedStatus {
+        FeedStatus { late: self.late, ..FeedStatus::default() }
+    }
+}
+
+/// What an open camera had when asked.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub enum Arrival {
+    /// A frame: its number, which wraps around nowhere, when it was exposed by the camera's clock,
+    /// and when by ours.
+    Frame {
+        /// Counts frames that were lost too.
+        sequence: u64,
+        /// From any moment on.
+        stamp_s: f64,
+        /// By this machine's clock.
+        captured: Instant,
+        /// Bytes from one row to the next.
+        stride: usize,
+    },
+    /// A frame with parts missing.
+    Torn,
+    /// Nothing for a while.
+    Nothing,
+}
+
+/// One open camera, by one protocol. An error means that it has to be opened again.
+pub trait Driver: Send {
+    /// As [`Feed::next`].
+    fn next(&mut self, buffer: &mut Block<u8>) -> Result<Arrival>;
+
+    /// Take a frame and let it go; whether there was one.
+    fn skip(&mut self) -> Result<bool>;
+
+    /// Parts of frames that were asked for again.
+    fn resends(&self) -> u64 {
+        0
+    }
+}
+
+/// Opens the camera of a configuration for frames of a size.
+pub type Open = fn(&CameraTable, [usize; 2]) -> Result<Box<dyn Driver>>;
+
+/// A live camera, opened again when it was lost.
+pub struct Live {
+    settings: CameraTable,
+    size_px: [usize; 2],
+    open: Open,
+    driver: Option<Box<dyn Driver>>,
+    retry_at: Instant,
+    timeline: Timeline,
+    status: FeedStatus,
+    complaint: String,
+}
+
+impl Live {
+    /// The camera of a configuration, which need not be there yet.
+    pub fn new(settings: CameraTable, size_px: [usize; 2], open: Open) -> Self {
+        Self {
+            settings,
+            size_px,
+            open,
+            driver: None,
+            retry_at: Instant::now(),
+            timeline: Timeline::default(),
+            status: FeedStatus { absent: true, ..FeedStatus::default() },
+            complaint: String::new(),
+        }
+    }
+
+    /// The open camera, opened now if it is time to.
+    fn driver(&mut self) -> Option<&mut Box<dyn Driver>> {
+        if self.driver.is_none() {
+            let now = Instant::now();
+            if now < self.retry_at {
+                // Short, for whoever wants this thread to end.
+                std::thread::sleep((self.retry_at - now).min(RETRY / 20));
+                return None;
+            }
+            self.retry_at = now + RETRY;
+            match (self.open)(&self.settings, self.size_px) {
+                Ok(driver) => {
+                    tracing::info!("the camera is there");
+                    self.complaint.clear();
+                    self.status.absent = false;
+                    self.timeline.reopened();
+                    self.driver = Some(driver);
+                }
+                Err(error) => self.complain(&error),
+            }
+        }
+        self.driver.as_mut()
+    }
+
+    /// Say so once, not every second.
+    fn complain(&mut self, error: &Error) {
+        let complaint = error.to_string();
+        if complaint != self.complaint {
+            tracing::error!("no camera: {complaint}");
+            self.complaint = complaint;
+        }
+    }
+
+    fn lose(&mut self, error: &Error) {
+        self.complain(error);
+        self.driver = None;
+        self.status.absent = true;
+        self.status.losses += 1;
+        self.retry_at = Instant::now() + RETRY;
+    }
+}
+
+impl Feed for Live {
+    fn size_px(&self) -> [usize; 2] {
+        self.size_px
+    }
+
+    fn next(&mut self, buffer: &mut Block<u8>) -> Result<Next> {
+        let Some(driver) = self.driver() else { return Ok(Next::Nothing) };
+        let resends = driver.resends();
+        match driver.next(buffer) {
+            Ok(Arrival::Frame { sequence, stamp_s, captured, stride }) => {
+                self.status.resends += self.driver.as_ref().map_or(0, |d| d.resends()) - resends;
+                let time = self.timeline.frame(sequence, stamp_s, captured);
+                Ok(Next::Frame(Taken { time, captured, stride }))
+            }
+            Ok(Arrival::Torn) => Ok(Next::Torn),
+            Ok(Arrival::Nothing) => Ok(Next::Nothing),
+            Err(error) => {
+                self.lose(&error);
+                Ok(Next::Nothing)
+            }
+        }
+    }
+
+    fn skip(&mut self) -> Result<u64> {
+        let Some(driver) = self.driver() else { return Ok(0) };
+        driver.skip().map(u64::from).or_else(|error| {
+            self.lose(&error);
+            Ok(0)
+        })
+    }
+
+    fn status(&self) -> FeedStatus {
+        self.status
+    }
+}
+
+/// From a camera's numbers and clock to index and time since the first frame, over losses of the
+/// camera.
+#[derive(Default)]
+struct Timeline {
+    /// The newest frame, and when it was exposed by our clock.
+    last: Option<(FrameTime, Instant)>,
+    /// The camera's number and time that belong to an index and time of ours.
+    origin: Option<(u64, f64, FrameTime)>,
+}
+
+impl Timeline {
+    /// The camera's numbers and clock begin anew.
+    fn reopened(&mut self) {
+        self.origin = None;
+    }
+
+    fn frame(&mut self, sequence: u64, stamp_s: f64, captured: Instant) -> FrameTime {
+        let by_camera = self.origin.and_then(|(first, stamp, at)| {
+            let index = at.index.checked_add(sequence.checked_sub(first)?)?;
+            Some(FrameTime { index, t_s: at.t_s + (stamp_s - stamp) })
+        });
+        let time = by_camera.filter(|time| self.follows(*time, captured)).unwrap_or_else(|| {
+            let time = self.next_by_our_clock(captured);
+            self.origin = Some((sequence, stamp_s, time));
+            time
+        });
+        self.last = Some((time, captured));
+        time
+    }
+
+    fn follows(&self, time: FrameTime, captured: Instant) -> bool {
+        self.last.is_none_or(|(last, at)| {
+            let elapsed_s = captured.saturating_duration_since(at).as_secs_f64();
+            let step_s = time.t_s - last.t_s;
+            (last.index + 1..=last.index + FRAMES_LOST_MAX).contains(&time.index)
+                && step_s > 0.0
+                && (step_s - elapsed_s).abs() < CLOCK_JUMP_S
+        })
+    }
+
+    fn next_by_our_clock(&self, captured: Instant) -> FrameTime {
+        self.last.map_or(FrameTime::default(), |(last, at)| {
+            let elapsed = captured.saturating_duration_since(at).max(Duration::from_millis(1));
+            FrameTime { index: last.index + 1, t_s: last.t_s + elapsed.as_secs_f64() }
+        })
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn at(start: Instant, ms: u64) -> Instant {
+        start + Duration::from_millis(ms)
+    }
+
+    #[test]
+    fn time_and_index_follow_the_camera_and_go_on_after_it_was_lost() {
+        let (mut timeline, start) = (Timeline::default(), Instant::now());
+        let time = |t: FrameTime| (t.index, (t.t_s * 1000.0).round() as i64);
+        assert_eq!(time(timeline.frame(700, 50.0, start)), (0, 0));
+        assert_eq!(time(timeline.frame(701, 50.025, at(start, 31))), (1, 25));
+        // Two frames were lost on the way.
+        assert_eq!(time(timeline.frame(704, 50.1, at(start, 102))), (4, 100));
+        timeline.reopened();
+        assert_eq!(time(timeline.frame(0, 0.0, at(start, 5102))), (5, 5100));
+        assert_eq!(time(timeline.frame(1, 0.025, at(start, 5130))), (6, 5125));
+    }
+
+    #[test]
+    fn a_camera_whose_clock_or_numbers_jump_does_not_turn_time_back() {
+        let (mut timeline, start) = (Timeline::default(), Instant::now());
+        timeline.frame(10, 100.0, start);
+        for (sequence, stamp_s) in [
+            (11, 9000.0),
+            (12, 0.0),
+            (0, 0.025),
+            (1, f64::NAN),
+            (2, 0.1),
+            (u64::MAX, 0.1),
+            (3, 0.125),
+        ] {
+            let before = timeline.last.expect("one came").0;
+            let time = timeline.frame(sequence, stamp_s, at(start, 25 * (before.index + 1)));
+            assert!(time.index == before.index + 1 && time.t_s > before.t_s, "{time:?}");
+            assert!((time.t_s - 0.025 * time.index as f64).abs() < 1e-6, "{time:?}");
+        }
+    }
+
+    /// A camera that is lost after a few frames, and cannot be opened at every second try.
+    struct Fragile(u64);
+
+    impl Driver for Fragile {
+        fn next(&mut self, _: &mut Block<u8>) -> Result<Arrival> {
+            self.0 += 1;
+            if self.0 > 3 {
+                return Err(Error::failure("unplugged"));
+            }
+            let captured = Instant::now();
+            let stamp_s = captured.elapsed().as_secs_f64() + self.0 as f64 / 40.0;
+            Ok(Arrival::Frame { sequence: self.0, stamp_s, captured, stride: 4 })
+        }
+
+        fn skip(&mut self) -> Result<bool> {
+            Ok(false)
+        }
+    }
+
+    #[test]
+    fn a_lost_camera_is_opened_again() {
+        use std::sync::atomic::{AtomicU64, Ordering};
+        static OPENED: AtomicU64 = AtomicU64::new(0);
+        let open: Open = |_, _| match OPENED.fetch_add(1, Ordering::Relaxed) % 2 {
+            0 => Err(Error::failure("not there")),
+            _ => Ok(Box::new(Fragile(0))),
+        };
+        let settings = CameraTable::new("camera.toml".into());
+        let mut live = Live::new(settings, [4, 4], open);
+        let (mut buffer, start) = (Block::own(16).expect("small"), Instant::now());
+        let mut indices = Vec::new();
+        while indices.len() < 6 && start.elapsed() < Duration::from_secs(30) {
+            assert!(live.next(&mut buffer).is_ok_and(|next| {
+                if let Next::Frame(taken) = next {
+                    indices.push(taken.time.index);
+                }
+                next != Next::End
+            }));
+            assert_eq!(live.status().absent, live.driver.is_none());
+        }
+        assert_eq!((indices, live.status().losses), (vec![0, 1, 2, 3, 4, 5], 1));
+    }
+}
