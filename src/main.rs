@@ -9,7 +9,7 @@ use beltgauge::event::ParcelRecord;
 use beltgauge::run::budget::{self, StraightDown};
 use beltgauge::run::calibrate::{self, DataSheet};
 use beltgauge::run::offline::{self, Observer, Outputs};
-use beltgauge::run::{demo, import, live};
+use beltgauge::run::{demo, import, live, privileges, update};
 use beltgauge::{run, source};
 use clap::{Parser, Subcommand};
 use std::io::{IsTerminal, Write};
@@ -27,6 +27,9 @@ struct Cli {
     /// How the log on standard error looks; `RUST_LOG` says how much is in it.
     #[arg(long, global = true, value_enum, default_value_t = LogFormat::Text)]
     log: LogFormat,
+    /// Become this user, given by number, and keep only the capabilities that are needed.
+    #[arg(long, global = true)]
+    user: Option<u32>,
     #[command(subcommand)]
     command: Command,
 }
@@ -112,6 +115,17 @@ enum Command {
         /// Folder to put configurations into.
         #[arg(long, default_value = STORE)]
         store: PathBuf,
+    },
+    /// Put the new system on a stick into the boot partition, to be tried at the next start.
+    Update {
+        /// The stick: a folder with `beltgauge/beltgauge.efi` in it.
+        dir: PathBuf,
+        /// Folder that `import` puts configurations into: its key is asked for.
+        #[arg(long, default_value = STORE)]
+        store: PathBuf,
+        /// Folder of the boot partition.
+        #[arg(long, default_value = "/boot/EFI/Linux")]
+        to: PathBuf,
     },
 }
 
@@ -252,7 +266,8 @@ fn thickness(text: &str) -> std::result::Result<f64, String> {
 fn main() -> ExitCode {
     let cli = Cli::parse();
     start_log(&cli);
-    match dispatch(cli.command) {
+    let user = cli.user.map_or(Ok(()), privileges::become_user);
+    match user.and_then(|()| dispatch(cli.command)) {
         Ok(()) => ExitCode::SUCCESS,
         Err(error) => {
             let _ = writeln!(std::io::stderr(), "error: {error}");
@@ -327,6 +342,10 @@ fn dispatch(command: Command) -> Result<()> {
                 Some(dir) => import::import(&dir, &store)?,
                 None => import::roll_back(&store)?,
             };
+            print(format_args!("{}", report.trim_end()))
+        }
+        Command::Update { dir, store, to } => {
+            let report = update::update(&dir, &Store::new(&store), &to)?;
             print(format_args!("{}", report.trim_end()))
         }
         Command::Check { config, store } => {

@@ -3,8 +3,9 @@
 
 use beltgauge::config::{Config, Site};
 use beltgauge::event::{Flags, ParcelRecord};
-use beltgauge::run::{Appliance, Pace};
+use beltgauge::run::Appliance;
 use beltgauge::source::synthetic::{Scenario, Synthetic};
+use beltgauge::source::{Pace, Paced};
 use hil::plc::{Client, map};
 use std::net::TcpListener;
 use std::sync::atomic::{AtomicBool, Ordering};
@@ -47,7 +48,7 @@ fn measure(counting: bool) -> Vec<ParcelRecord> {
     let camera = scenario.camera().expect("valid");
     let site = Site::new(Config::parse(&config).expect("valid"), camera).expect("in view");
     let mut source = Synthetic::new(scenario).expect("renders");
-    let appliance = Appliance::new(site, Pace::RealTime).expect("the port is free");
+    let appliance = Appliance::new(site).expect("the port is free");
     let (done, mut records) = (AtomicBool::new(false), Vec::new());
     std::thread::scope(|scope| {
         if counting {
@@ -64,7 +65,7 @@ fn measure(counting: bool) -> Vec<ParcelRecord> {
                 }
             });
         }
-        let ran = appliance.run(&mut source, |_, new| {
+        let ran = appliance.run(&mut Paced::new(&mut source, Pace::RealTime), |_, new| {
             records.extend(new);
             true
         });

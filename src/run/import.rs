@@ -119,7 +119,7 @@ fn stage(root: &Path, store: &Store, locked: &Locked<'_>, report: &mut String) -
 
 /// The key that the configuration in force asks for. When that cannot be read, nothing is accepted:
 /// a damaged file must not open the door.
-fn key_in_force(store: &Store) -> Result<Option<minisign_verify::PublicKey>> {
+pub(super) fn key_in_force(store: &Store) -> Result<Option<minisign_verify::PublicKey>> {
     let path = store.config();
     let text = match std::fs::read_to_string(&path) {
         Ok(text) => text,

@@ -10,8 +10,10 @@ pub mod import;
 pub mod live;
 mod memory;
 pub mod offline;
+pub mod privileges;
 mod realtime;
 mod report;
+pub mod update;
 mod watchdog;
 
 pub use annotate::Annotator;
