@@ -371,11 +371,15 @@ pub struct Can {
     pub fd: bool,
     /// Identifier of the first message; 16 are taken.
     pub base_id: u16,
+    /// Bit rate to set up the interface with; none given: the system has set it up.
+    pub bitrate: Option<u32>,
+    /// Bit rate of the data of CAN FD frames; none given: the same.
+    pub data_bitrate: Option<u32>,
 }
 
 impl Default for Can {
     fn default() -> Self {
-        Self { interface: None, fd: false, base_id: 0x500 }
+        Self { interface: None, fd: false, base_id: 0x500, bitrate: None, data_bitrate: None }
     }
 }
 
@@ -516,6 +520,12 @@ impl Can {
     fn check(&self) -> Result<()> {
         // Standard identifiers have 11 bits.
         count("can.base_id", usize::from(self.base_id), 1, 0x7f0)?;
+        for (key, rate, max) in [
+            ("can.bitrate", self.bitrate, 1_000_000),
+            ("can.data_bitrate", self.data_bitrate, 8_000_000),
+        ] {
+            rate.map_or(Ok(()), |rate| count(key, rate as usize, 10_000, max))?;
+        }
         let Some(name) = &self.interface else { return Ok(()) };
         if (1..16).contains(&name.len()) && name.bytes().all(|b| b.is_ascii_graphic() && b != b'/')
         {

@@ -7,6 +7,7 @@ pub mod dbc;
 pub mod document;
 pub mod frames;
 mod guard;
+pub mod interface;
 pub mod journal;
 pub mod link;
 pub mod modbus;

@@ -5,6 +5,7 @@ use crate::config::Site;
 use crate::config::store::{ImportRecord, Store};
 use crate::error::{Error, Result};
 use crate::event::ParcelRecord;
+use crate::plc::interface;
 use crate::plc::registers::ImportStatus;
 use crate::source::{Live, open_camera};
 use serde::Serialize;
@@ -42,6 +43,7 @@ pub fn run(options: &Options<'_>) -> Result<()> {
     if options.config.is_none() {
         site.config.plc.state_file.get_or_insert_with(|| store.plc_state());
     }
+    interface::set_up(&site.config.can)?;
     let camera = site.config.camera.clone();
     let mut feed = Live::new(camera, site.camera.image_size_px, open_camera);
     let listen = site.config.modbus.listen;

@@ -7,9 +7,11 @@ use rustix::thread::{
 };
 use rustix::thread::{Gid, Uid};
 
-/// Modbus's port 502, real-time priority, locked memory.
-const KEPT: CapabilitySet =
-    CapabilitySet::NET_BIND_SERVICE.union(CapabilitySet::SYS_NICE).union(CapabilitySet::IPC_LOCK);
+/// Modbus's port 502, bit rates of CAN, real-time priority, locked memory.
+const KEPT: CapabilitySet = CapabilitySet::NET_BIND_SERVICE
+    .union(CapabilitySet::NET_ADMIN)
+    .union(CapabilitySet::SYS_NICE)
+    .union(CapabilitySet::IPC_LOCK);
 
 /// Become user and group `id`, for good. Called while the process has one thread: the kernel knows
 /// users of threads only.

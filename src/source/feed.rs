@@ -287,49 +287,59 @@ impl Feed for Live {
 }
 
 /// From a camera's numbers and clock to index and time since the first frame, over losses of the
-/// camera.
+/// camera. Each begins anew by itself when it jumps; some drivers number every frame 0.
 #[derive(Default)]
 struct Timeline {
     /// The newest frame, and when it was exposed by our clock.
     last: Option<(FrameTime, Instant)>,
-    /// The camera's number and time that belong to an index and time of ours.
-    origin: Option<(u64, f64, FrameTime)>,
+    /// The camera's number that belongs to an index of ours.
+    numbers: Option<(u64, u64)>,
+    /// The camera's time that belongs to a time of ours.
+    clock: Option<(f64, f64)>,
 }
 
 impl Timeline {
     /// The camera's numbers and clock begin anew.
     fn reopened(&mut self) {
-        self.origin = None;
+        (self.numbers, self.clock) = (None, None);
     }
 
     fn frame(&mut self, sequence: u64, stamp_s: f64, captured: Instant) -> FrameTime {
-        let by_camera = self.origin.and_then(|(first, stamp, at)| {
-            let index = at.index.checked_add(sequence.checked_sub(first)?)?;
-            Some(FrameTime { index, t_s: at.t_s + (stamp_s - stamp) })
-        });
-        let time = by_camera.filter(|time| self.follows(*time, captured)).unwrap_or_else(|| {
-            let time = self.next_by_our_clock(captured);
-            self.origin = Some((sequence, stamp_s, time));
-            time
-        });
+        let time = match self.last {
+            None => FrameTime::default(),
+            Some((last, at)) => {
+                let elapsed_s = captured.saturating_duration_since(at).as_secs_f64();
+                FrameTime {
+                    index: self.index(sequence, last.index),
+                    t_s: self.t_s(stamp_s, last.t_s, elapsed_s),
+                }
+            }
+        };
+        self.numbers.get_or_insert((sequence, time.index));
+        self.clock.get_or_insert((stamp_s, time.t_s));
         self.last = Some((time, captured));
         time
     }
 
-    fn follows(&self, time: FrameTime, captured: Instant) -> bool {
-        self.last.is_none_or(|(last, at)| {
-            let elapsed_s = captured.saturating_duration_since(at).as_secs_f64();
-            let step_s = time.t_s - last.t_s;
-            (last.index + 1..=last.index + FRAMES_LOST_MAX).contains(&time.index)
-                && step_s > 0.0
-                && (step_s - elapsed_s).abs() < CLOCK_JUMP_S
+    fn index(&mut self, sequence: u64, last: u64) -> u64 {
+        let by_camera = self.numbers.and_then(|(first, index)| {
+            let ahead = sequence.checked_sub(first)?;
+            index
+                .checked_add(ahead)
+                .filter(|index| (last + 1..=last + FRAMES_LOST_MAX).contains(index))
+        });
+        by_camera.unwrap_or_else(|| {
+            self.numbers = None;
+            last + 1
         })
     }
 
-    fn next_by_our_clock(&self, captured: Instant) -> FrameTime {
-        self.last.map_or(FrameTime::default(), |(last, at)| {
-            let elapsed = captured.saturating_duration_since(at).max(Duration::from_millis(1));
-            FrameTime { index: last.index + 1, t_s: last.t_s + elapsed.as_secs_f64() }
+    fn t_s(&mut self, stamp_s: f64, last_s: f64, elapsed_s: f64) -> f64 {
+        let by_camera = self.clock.map(|(first_s, t_s)| t_s + (stamp_s - first_s));
+        let follows = |t_s: &f64| *t_s > last_s && (t_s - last_s - elapsed_s).abs() < CLOCK_JUMP_S;
+        by_camera.filter(follows).unwrap_or_else(|| {
+            self.clock = None;
+            last_s + elapsed_s.max(0.001)
         })
     }
 }
@@ -359,6 +369,8 @@ mod tests {
     fn a_camera_whose_clock_or_numbers_jump_does_not_turn_time_back() {
         let (mut timeline, start) = (Timeline::default(), Instant::now());
         timeline.frame(10, 100.0, start);
+        // Time goes on by our clock where the camera's jumps; of two frames with one number the second
+        // is the next one.
         for (sequence, stamp_s) in [
             (11, 9000.0),
             (12, 0.0),
@@ -372,6 +384,17 @@ mod tests {
             let time = timeline.frame(sequence, stamp_s, at(start, 25 * (before.index + 1)));
             assert!(time.index == before.index + 1 && time.t_s > before.t_s, "{time:?}");
             assert!((time.t_s - 0.025 * time.index as f64).abs() < 1e-6, "{time:?}");
+        }
+    }
+
+    #[test]
+    fn a_driver_that_numbers_every_frame_0_has_its_clock_followed() {
+        let (mut timeline, start) = (Timeline::default(), Instant::now());
+        for n in 0..50u64 {
+            // Its clock is even, ours is late by up to 20 ms.
+            let captured = at(start, 40 * n + n * 7 % 20);
+            let time = timeline.frame(0, 7.0 + 0.04 * n as f64, captured);
+            assert!(time.index == n && (time.t_s - 0.04 * n as f64).abs() < 1e-9, "{time:?}");
         }
     }
 
