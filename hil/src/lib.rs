@@ -1,6 +1,7 @@
 //! Hardware in the loop without hardware: the real binary, and peers that the project did not
 //! write. Here is what its tests share; the tests are in `hil/tests`.
 
+pub mod appliance;
 pub mod can_peer;
 pub mod machine;
 #[cfg(feature = "opencv")]
@@ -8,6 +9,7 @@ pub mod opencv_chain;
 pub mod plc;
 pub mod scene;
 pub mod server;
+pub mod shell;
 
 use std::net::{SocketAddr, TcpListener, TcpStream};
 use std::path::{Path, PathBuf};

@@ -1,23 +1,18 @@
 //! The emulated machine: QEMU with Debian's kernel, two Kvaser CAN cards on one bus, a virtual CAN
 //! bus, and the static binaries. See `hil/machine`.
 
-use std::io::{BufRead, BufReader, Write};
+use crate::shell::Shell;
 use std::net::{SocketAddr, TcpListener};
+use std::ops::{Deref, DerefMut};
 use std::path::{Path, PathBuf};
-use std::process::{Child, ChildStdin, Command, Stdio};
-use std::sync::mpsc::{Receiver, RecvTimeoutError, channel};
-use std::time::Duration;
+use std::process::Command;
 
 /// The triple that the static binaries are built for.
 const TARGET: &str = "x86_64-unknown-linux-gnu";
-/// Emulation without acceleration boots in 8 to 25 s.
-const PATIENCE: Duration = Duration::from_mins(3);
 
 /// A running machine; dropped, it is switched off.
 pub struct Machine {
-    child: Child,
-    shell: ChildStdin,
-    lines: Receiver<String>,
+    shell: Shell,
     /// Where port 1502 of the machine is reached.
     pub modbus: SocketAddr,
 }
@@ -56,26 +51,9 @@ impl Machine {
         let free = TcpListener::bind("127.0.0.1:0").expect("a free port");
         let modbus = free.local_addr().expect("bound");
         drop(free);
-        let mut child = Self::command(&out, modbus)
-            .stdin(Stdio::piped())
-            .stdout(Stdio::piped())
-            .spawn()
-            .expect("qemu-system-x86_64 is installed");
-        let shell = child.stdin.take().expect("piped");
-        let output = BufReader::new(child.stdout.take().expect("piped"));
-        let (sender, lines) = channel();
-        std::thread::spawn(move || {
-            // Lines until the machine is switched off.
-            for line in output.split(b'\n').map_while(Result::ok) {
-                let line = String::from_utf8_lossy(&line).trim_end().to_owned();
-                if sender.send(line).is_err() {
-                    break;
-                }
-            }
-        });
-        let machine = Self { child, shell, lines, modbus };
-        machine.answer();
-        machine
+        let shell = Shell::start(Self::command(&out, modbus));
+        shell.ready();
+        Self { shell, modbus }
     }
 
     fn command(out: &Path, modbus: SocketAddr) -> Command {
@@ -94,45 +72,17 @@ impl Machine {
             .args(["-nic", &format!("user,model=virtio-net-pci,hostfwd=tcp:{modbus}-:1502")]);
         command
     }
+}
 
-    /// Lines up to the status that ends an answer.
-    fn answer(&self) -> (String, String) {
-        let mut text = String::new();
-        loop {
-            match self.lines.recv_timeout(PATIENCE) {
-                Ok(line) => match line.strip_prefix("== ") {
-                    Some(status) => return (text, status.to_owned()),
-                    None => text.extend([line.as_str(), "\n"]),
-                },
-                Err(RecvTimeoutError::Timeout) => panic!("the machine does not answer: {text}"),
-                Err(RecvTimeoutError::Disconnected) => panic!("the machine has stopped: {text}"),
-            }
-        }
-    }
-
-    /// Run a line in the machine's shell; returns what it printed and its exit status.
-    ///
-    /// # Panics
-    /// When the machine does not answer.
-    pub fn try_run(&mut self, line: &str) -> (String, String) {
-        writeln!(self.shell, "{line}").expect("the machine runs");
-        self.answer()
-    }
-
-    /// The same for a line that must succeed.
-    ///
-    /// # Panics
-    /// When it fails.
-    pub fn run(&mut self, line: &str) -> String {
-        let (text, status) = self.try_run(line);
-        assert_eq!(status, "0", "{line}: {text}");
-        text
+impl Deref for Machine {
+    type Target = Shell;
+    fn deref(&self) -> &Shell {
+        &self.shell
     }
 }
 
-impl Drop for Machine {
-    fn drop(&mut self) {
-        let _ = self.child.kill();
-        let _ = self.child.wait();
+impl DerefMut for Machine {
+    fn deref_mut(&mut self) -> &mut Shell {
+        &mut self.shell
     }
 }

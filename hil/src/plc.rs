@@ -159,6 +159,16 @@ impl Plc {
         self.client = None;
     }
 
+    /// A value of the status block, by name.
+    ///
+    /// # Errors
+    /// Those of the socket.
+    pub fn status(&self, name: &str) -> std::io::Result<f64> {
+        let register = &self.map[&format!("status.{name}")];
+        let block = Client::connect(self.address)?.read(register.address, 2)?;
+        Ok(self.value(&format!("status.{name}"), register.address, &block))
+    }
+
     /// A value of a block that was read from `start` on.
     fn value(&self, name: &str, start: u16, registers: &[u16]) -> f64 {
         let register = &self.map[name];
