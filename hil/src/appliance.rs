@@ -125,10 +125,14 @@ impl Bench {
         let _ = std::fs::remove_dir_all(&folder);
         std::fs::create_dir_all(&folder).expect("room");
         let SiteOptions { scale_interval_mm, device, more } = options;
+        let can = match self.arch {
+            Arch::X86 => "[can]\ninterface = \"can0\"\nbitrate = 500000\n",
+            Arch::Arm => "",
+        };
         let text = format!(
             "[camera]\ncalibration = \"camera.toml\"\ndevice = \"{device}\"\n{more}\n[zone]\n\
              x_min_mm = -500\nx_max_mm = 500\ny_min_mm = -300\ny_max_mm = 300\n[belt]\n\
-             speed_mm_per_s = 204\n[plc]\nqueue = true\nscale_interval_mm = {scale_interval_mm}\n"
+             speed_mm_per_s = 204\n{can}[plc]\nqueue = true\nscale_interval_mm = {scale_interval_mm}\n"
         );
         std::fs::write(folder.join("beltgauge.toml"), text).expect("room");
         std::fs::write(folder.join("camera.toml"), CAMERA).expect("room");
@@ -162,7 +166,8 @@ impl Bench {
     /// When there is no room.
     pub fn disk(&self, name: &str) -> PathBuf {
         let disk = self.out.join(format!("{name}.disk"));
-        std::fs::copy(self.out.join("test.img"), &disk).expect("room");
+        std::fs::copy(self.out.join(format!("test-{}.img", self.arch.name())), &disk)
+            .expect("room");
         disk
     }
 
@@ -321,11 +326,11 @@ impl Appliance {
         }
     }
 
-    /// Wait for a register of the status block.
+    /// Wait for the stored number of a register of the status block.
     ///
     /// # Panics
     /// When it does not come to that.
-    pub fn wait(&self, what: &str, name: &str, holds: impl Fn(f64) -> bool) -> f64 {
+    pub fn wait(&self, what: &str, name: &str, holds: impl Fn(u32) -> bool) -> u32 {
         let (plc, start) = (Plc::new(self.modbus), Instant::now());
         loop {
             let value = plc.status(name);
@@ -340,7 +345,7 @@ impl Appliance {
     }
 
     /// A register of the status block, once it answers.
-    pub fn status(&self, name: &str) -> f64 {
+    pub fn status(&self, name: &str) -> u32 {
         self.wait("it answers", name, |_| true)
     }
 }

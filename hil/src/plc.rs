@@ -126,6 +126,12 @@ pub struct Parcel {
     pub size_mm: [f64; 3],
 }
 
+/// The stored number of a value that begins `registers`.
+fn bits(register: &Register, registers: &[u16]) -> u32 {
+    let first = u32::from(registers[0]);
+    if register.long { first << 16 | u32::from(registers[1]) } else { first }
+}
+
 /// Where the PLC sends parcels.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Chute {
@@ -159,25 +165,20 @@ impl Plc {
         self.client = None;
     }
 
-    /// A value of the status block, by name.
+    /// The stored number of a value of the status block, by name.
     ///
     /// # Errors
     /// Those of the socket.
-    pub fn status(&self, name: &str) -> std::io::Result<f64> {
+    pub fn status(&self, name: &str) -> std::io::Result<u32> {
         let register = &self.map[&format!("status.{name}")];
         let block = Client::connect(self.address)?.read(register.address, 2)?;
-        Ok(self.value(&format!("status.{name}"), register.address, &block))
+        Ok(bits(register, &block))
     }
 
     /// A value of a block that was read from `start` on.
     fn value(&self, name: &str, start: u16, registers: &[u16]) -> f64 {
         let register = &self.map[name];
-        let at = usize::from(register.address - start);
-        let bits = if register.long {
-            u32::from(registers[at]) << 16 | u32::from(registers[at + 1])
-        } else {
-            u32::from(registers[at])
-        };
+        let bits = bits(register, &registers[usize::from(register.address - start)..]);
         let number = match (register.signed, register.long) {
             (false, _) => f64::from(bits),
             (true, true) => f64::from(bits as i32),

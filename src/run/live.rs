@@ -1,8 +1,8 @@
 //! `beltgauge run`: the appliance on a live camera, until it is told to stop.
 
-use super::{Appliance, Progress, Watchdog};
-use crate::config::Site;
+use super::{Appliance, ImportBoard, Progress, Watchdog};
 use crate::config::store::{ImportRecord, Store};
+use crate::config::{Can, Site};
 use crate::error::{Error, Result};
 use crate::event::ParcelRecord;
 use crate::plc::interface;
@@ -43,21 +43,21 @@ pub fn run(options: &Options<'_>) -> Result<()> {
     if options.config.is_none() {
         site.config.plc.state_file.get_or_insert_with(|| store.plc_state());
     }
-    interface::set_up(&site.config.can)?;
+    let mut can = CanSetUp { settings: site.config.can.clone(), done: false, complaint: None };
     let camera = site.config.camera.clone();
     let mut feed = Live::new(camera, site.camera.image_size_px, open_camera);
     let listen = site.config.modbus.listen;
     let watchdog = Watchdog::new(options.watchdog)?;
     let (appliance, imports) = Appliance::new(site)?.supervised(watchdog);
     tracing::info!("measuring; Modbus TCP on {listen}");
+    tell(&imports, store.last_import());
     let mut kept_at: Option<Instant> = None;
     let progress = appliance.run(&mut feed, |progress, records| {
         records.for_each(|record| log(&record));
         if kept_at.is_none_or(|at| at.elapsed() >= HOUSEKEEPING) {
             kept_at = Some(Instant::now());
-            let ImportRecord { count, result } = store.last_import();
-            let status = ImportStatus { count, result: result as u16 };
-            *imports.lock().unwrap_or_else(std::sync::PoisonError::into_inner) = status;
+            can.try_now();
+            tell(&imports, store.last_import());
             if let Some(path) = options.status {
                 write_status(path, progress);
             }
@@ -66,6 +66,37 @@ pub fn run(options: &Options<'_>) -> Result<()> {
     })?;
     tracing::info!("stopped; {}", progress.status.counters);
     Ok(())
+}
+
+/// The CAN interface, which may be plugged in later than the power.
+struct CanSetUp {
+    settings: Can,
+    done: bool,
+    complaint: Option<String>,
+}
+
+impl CanSetUp {
+    fn try_now(&mut self) {
+        if self.done {
+            return;
+        }
+        match interface::set_up(&self.settings) {
+            Ok(()) => self.done = true,
+            Err(e) => {
+                // Once, not every second.
+                let complaint = Some(e.to_string());
+                if self.complaint != complaint {
+                    tracing::error!("{e}");
+                    self.complaint = complaint;
+                }
+            }
+        }
+    }
+}
+
+fn tell(board: &ImportBoard, ImportRecord { count, result }: ImportRecord) {
+    let status = ImportStatus { count, result: result as u16 };
+    *board.lock().unwrap_or_else(std::sync::PoisonError::into_inner) = status;
 }
 
 fn log(record: &ParcelRecord) {
@@ -123,9 +154,9 @@ fn write_status(path: &Path, progress: &Progress) {
     let mut new = path.as_os_str().to_owned();
     new.push(".new");
     let new = PathBuf::from(new);
-    let written = serde_json::to_vec(&file)
+    let written = serde_json::to_string(&file)
         .map_err(std::io::Error::from)
-        .and_then(|bytes| std::fs::write(&new, bytes))
+        .and_then(|line| std::fs::write(&new, line + "\n"))
         .and_then(|()| std::fs::rename(&new, path));
     if let Err(e) = written {
         tracing::warn!("the status file {} cannot be written: {e}", path.display());

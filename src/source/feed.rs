@@ -256,7 +256,14 @@ impl Feed for Live {
     }
 
     fn next(&mut self, buffer: &mut Block<u8>) -> Result<Next> {
-        let Some(driver) = self.driver() else { return Ok(Next::Nothing) };
+        let bytes = self.size_px.iter().product();
+        let Some(driver) = self.driver() else {
+            // What a lost camera had lent keeps its device busy.
+            if buffer.is_foreign() {
+                *buffer = Block::own(bytes)?;
+            }
+            return Ok(Next::Nothing);
+        };
         let resends = driver.resends();
         match driver.next(buffer) {
             Ok(Arrival::Frame { sequence, stamp_s, captured, stride }) => {

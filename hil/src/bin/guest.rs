@@ -6,6 +6,7 @@ use beltgauge::config::CameraTable;
 use beltgauge::plan::Block;
 use beltgauge::source::{Arrival, open_camera};
 use nix::sys::ptrace;
+use nix::sys::wait::{WaitPidFlag, WaitStatus, waitpid};
 use nix::unistd::Pid;
 use std::fs::File;
 use std::io::{BufRead, BufReader, Read};
@@ -132,7 +133,12 @@ fn freeze(pid: &str, thread: &str) {
             ptrace::seize(tid, ptrace::Options::empty()).expect("may be traced");
             ptrace::interrupt(tid).expect("may be stopped");
             println!("{thread} is frozen");
-            std::thread::sleep(Duration::from_mins(10));
+            // Until it is killed; without a wait it would stay as a zombie, and its process with it.
+            while let Ok(status) = waitpid(tid, Some(WaitPidFlag::__WALL)) {
+                if matches!(status, WaitStatus::Exited(..) | WaitStatus::Signaled(..)) {
+                    break;
+                }
+            }
             return;
         }
     }

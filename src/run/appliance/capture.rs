@@ -1,9 +1,10 @@
 //! The capture thread: frames from the feed into the ring, as long as there are buffers.
 
-use super::{Frame, Shared};
+use super::{FRAME_RING, Frame, Shared};
 use crate::error::Result;
 use crate::plan::Block;
 use crate::source::{Feed, Next};
+use heapless::Deque;
 use heapless::spsc::{Consumer, Producer};
 use std::sync::atomic::{AtomicU64, Ordering};
 
@@ -13,8 +14,8 @@ pub(super) struct Capture<'a> {
     free: Consumer<'a, Block<u8>>,
     ready: Producer<'a, Frame>,
     shared: &'a Shared,
-    /// A buffer that nothing was put into.
-    empty: Option<Block<u8>>,
+    /// Buffers that nothing was put into.
+    empty: Deque<Block<u8>, FRAME_RING>,
     /// Index of the newest frame.
     newest: Option<u64>,
     /// Frames that were let go since then, for want of a buffer.
@@ -28,7 +29,7 @@ impl<'a> Capture<'a> {
         ready: Producer<'a, Frame>,
         shared: &'a Shared,
     ) -> Self {
-        Self { feed, free, ready, shared, empty: None, newest: None, let_go: 0 }
+        Self { feed, free, ready, shared, empty: Deque::new(), newest: None, let_go: 0 }
     }
 
     pub(super) fn run(mut self) -> Result<()> {
@@ -38,11 +39,18 @@ impl<'a> Capture<'a> {
         result
     }
 
+    fn keep(&mut self, pixels: Block<u8>) {
+        // There are no more buffers than places.
+        let _ = self.empty.push_back(pixels);
+    }
+
     fn frames(&mut self) -> Result<()> {
         let add = |counter: &AtomicU64, count: u64| counter.fetch_add(count, Ordering::Relaxed);
         while !self.shared.stopped() {
             self.shared.beats.capture.beat();
-            let Some(mut pixels) = self.empty.take().or_else(|| self.free.dequeue()) else {
+            // In turn, so that a camera that is lost gets back all that it had lent.
+            let next = self.free.dequeue().or_else(|| self.empty.pop_front());
+            let Some(mut pixels) = next else {
                 let count = self.feed.skip()?;
                 self.let_go += count;
                 add(&self.shared.frames_dropped, count);
@@ -69,9 +77,9 @@ impl<'a> Capture<'a> {
                     // It is missing in the count of frames, but not lost on the way.
                     self.let_go += 1;
                     add(&self.shared.frames_torn, 1);
-                    self.empty = Some(pixels);
+                    self.keep(pixels);
                 }
-                Next::Nothing => self.empty = Some(pixels),
+                Next::Nothing => self.keep(pixels),
                 Next::End => return Ok(()),
             }
         }
