@@ -161,7 +161,7 @@ fn formats(device: &str) {
         let mut settings = CameraTable::new("camera.toml".into());
         (settings.device, settings.format) = (Some(device.to_owned()), Some(format.to_owned()));
         // "Gray Ramp", and no text in it.
-        settings.controls.insert("test_pattern".into(), 21.into());
+        settings.controls.insert("test_pattern".into(), 20.into());
         settings.controls.insert("osd_text_mode".into(), 2.into());
         let mut driver = open_camera(&settings, SIZE).unwrap_or_else(|e| panic!("{format}: {e}"));
         let (mut buffer, start) = (Block::own(SIZE[0] * SIZE[1]).expect("small"), Instant::now());
