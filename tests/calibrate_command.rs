@@ -247,3 +247,39 @@ fn a_lens_file_that_is_none_is_named() {
     let missing = ["--points", "p.csv", "--lens", "no.toml", "--out", "camera.toml"];
     refused(&calibrate("belt", &missing, &folder), 2, &["no.toml", "calibrate lens"]);
 }
+
+#[test]
+fn a_stick_with_stills_is_calibrated_as_it_is_imported() {
+    let root = scratch("import-stills");
+    let stick = root.join("stick/beltgauge");
+    for folder in ["lens", "belt"] {
+        fs::create_dir_all(stick.join(folder)).expect("writable");
+    }
+    write_views(&stick.join("lens"));
+    write_pass(&stick.join("belt"));
+    let config = "[camera]\ncalibration = \"camera.toml\"\n[zone]\nx_min_mm = -250\nx_max_mm = 250\n\
+                  y_min_mm = -150\ny_max_mm = 150\n[belt]\nspeed_mm_per_s = 500\n";
+    fs::write(stick.join("beltgauge.toml"), config).expect("writable");
+    let board = "board = [5, 8]\nsquare_mm = 30\nboard_thickness_mm = 3\n";
+    fs::write(stick.join("calibration.toml"), board).expect("writable");
+    let import = || {
+        let store = root.join("store");
+        run(beltgauge().arg("import").arg(root.join("stick")).arg("--store").arg(store))
+    };
+    let output = import();
+    assert_eq!(output.status.code(), Some(0), "{}", text(&output.stderr));
+    let report = text(&output.stdout);
+    assert!(report.contains("view_07.png") && report.contains("is in force"), "{report}");
+    let camera = CameraFile::load(&root.join("store/current/camera.toml")).expect("a camera");
+    // As in the test above.
+    assert!((camera.centre_in_belt().z - HEIGHT_MM).abs() < 1.5, "{camera:?}");
+    // A still that is none is rejected with its reason; no still of the belt is an error.
+    fs::write(stick.join("lens/view_03.png"), "no picture").expect("writable");
+    refused(&import(), 1, &["view_03.png"]);
+    fs::remove_dir_all(stick.join("belt")).expect("there");
+    fs::remove_file(stick.join("lens/view_03.png")).expect("there");
+    refused(&import(), 2, &["belt", "no stills"]);
+    fs::write(stick.join("calibration.toml"), "board = [1, 8]\nsquare_mm = 30\n")
+        .expect("writable");
+    refused(&import(), 2, &["calibration.toml", "3 to 60 inner corners"]);
+}

@@ -1,0 +1,110 @@
+//! `beltgauge run` on a machine without a camera: it waits for one, says so, and ends in order.
+
+mod common;
+
+use common::{beltgauge, scratch, write_site};
+use std::fs;
+use std::path::Path;
+use std::process::{Child, Stdio};
+use std::time::{Duration, Instant};
+
+const SIZE: [usize; 2] = [320, 240];
+
+struct Run(Child);
+
+impl Drop for Run {
+    fn drop(&mut self) {
+        let _ = self.0.kill();
+        let _ = self.0.wait();
+    }
+}
+
+/// Start it with a camera that is not there.
+fn start(folder: &Path, camera: &str, arguments: &[&str]) -> Run {
+    let config = write_site(folder, SIZE);
+    let text = fs::read_to_string(&config).expect("there");
+    let text = text.replace("[zone]", &format!("{camera}\n[zone]"));
+    fs::write(&config, text + "[modbus]\nlisten = \"127.0.0.1:0\"\n").expect("room");
+    let log = fs::File::create(folder.join("log")).expect("room");
+    let child = beltgauge()
+        .args(arguments)
+        .args(["run", "--config"])
+        .arg(&config)
+        .arg("--status")
+        .arg(folder.join("status.json"))
+        .stdout(Stdio::null())
+        .stderr(log)
+        .spawn();
+    Run(child.expect("starts"))
+}
+
+/// Wait for words in a file; returns it.
+fn wait_for(path: &Path, words: &[&str]) -> String {
+    let start = Instant::now();
+    loop {
+        let text = fs::read_to_string(path).unwrap_or_default();
+        if words.iter().all(|word| text.contains(word)) {
+            return text;
+        }
+        assert!(start.elapsed() < Duration::from_secs(30), "{words:?} not in {text}");
+        std::thread::sleep(Duration::from_millis(50));
+    }
+}
+
+fn terminate(run: &mut Run) -> Option<i32> {
+    let pid = rustix::process::Pid::from_child(&run.0);
+    rustix::process::kill_process(pid, rustix::process::Signal::TERM).expect("runs");
+    let start = Instant::now();
+    loop {
+        if let Some(status) = run.0.try_wait().expect("a child") {
+            return status.code();
+        }
+        assert!(start.elapsed() < Duration::from_secs(20), "it does not end");
+        std::thread::sleep(Duration::from_millis(20));
+    }
+}
+
+#[test]
+fn without_a_camera_it_says_so_waits_and_ends_in_order() {
+    for (name, camera, words) in [
+        ("run-v4l2", "device = \"/dev/video99\"", &["no camera", "/dev/video99", "remedy"][..]),
+        ("run-named", "device = \"No Such Camera\"", &["no camera", "No Such Camera is not there"]),
+        ("run-gige", "interface = \"gige\"\ndevice = \"127.0.0.77\"", &["no camera", "127.0.0.77"]),
+    ] {
+        let folder = scratch(name);
+        let mut run = start(&folder, camera, &[]);
+        wait_for(&folder.join("log"), words);
+        wait_for(&folder.join("status.json"), &["\"camera_absent\":true", "\"frames\":0"]);
+        assert_eq!(terminate(&mut run), Some(0), "{name}");
+        let log = wait_for(&folder.join("log"), &["stopped"]);
+        assert_eq!(log.matches("no camera").count(), 1, "not every second: {log}");
+        assert!(!log.contains("panicked"), "{log}");
+    }
+}
+
+#[test]
+fn a_node_that_is_no_camera_is_told_as_such() {
+    let folder = scratch("run-null");
+    let _run = start(&folder, "device = \"/dev/null\"", &[]);
+    wait_for(&folder.join("log"), &["no camera", "/dev/null"]);
+}
+
+#[test]
+fn the_log_can_be_json() {
+    let folder = scratch("run-json");
+    let _run = start(&folder, "device = \"/dev/video99\"", &["--log", "json"]);
+    let log = wait_for(&folder.join("log"), &["no camera"]);
+    for line in log.lines() {
+        let event: serde_json::Value = serde_json::from_str(line).expect("JSON");
+        assert!(event["level"].is_string() && event["fields"]["message"].is_string(), "{line}");
+    }
+}
+
+#[test]
+fn without_a_configuration_it_ends_with_the_remedy() {
+    let folder = scratch("run-nothing");
+    let output = beltgauge().args(["run", "--store"]).arg(&folder).output().expect("starts");
+    let text = String::from_utf8_lossy(&output.stderr);
+    assert_eq!(output.status.code(), Some(2), "{text}");
+    assert!(text.contains("current/beltgauge.toml") && text.contains("remedy"), "{text}");
+}
