@@ -29,7 +29,9 @@ fn the_reference_has_every_key() {
         count += 1;
         let written = format!("{key} =");
         assert!(
-            text.contains(&written) || text.contains(&format!("[{key}]")),
+            text.contains(&written)
+                || text.contains(&format!("[{key}]"))
+                || text.contains(&format!(".{key}]")),
             "{key} is not in it"
         );
     }

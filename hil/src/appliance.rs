@@ -25,6 +25,8 @@ pub const PARCELS: [[f64; 3]; 3] =
     [[235.0, 125.0, 70.0], [300.0, 200.0, 150.0], [180.0, 140.0, 40.0]];
 /// Frames of the recording: then all have left.
 const FRAMES: u64 = 220;
+/// The frame in which the first parcel is in the middle.
+const PARCELS_IN_VIEW: u64 = 90;
 
 /// Which processor.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -52,6 +54,8 @@ pub enum Boot {
     Uefi,
     /// The same kernel and initramfs without the firmware, which takes half of the time.
     Direct,
+    /// The same on a belt with parcels already on it, so that the first leaves soon.
+    DirectAmongParcels,
 }
 
 /// What the tests share: the image, the recording, and where they work.
@@ -160,6 +164,11 @@ impl Bench {
         self.out.join(format!("beltgauge-{}.efi", self.arch.name()))
     }
 
+    /// The binary inside.
+    pub fn binary(&self) -> PathBuf {
+        self.out.join(self.arch.name()).join("root/bin/beltgauge")
+    }
+
     /// A fresh copy of the flashed disk.
     ///
     /// # Panics
@@ -221,12 +230,14 @@ impl Bench {
         }
         qemu.args(["-m", "768", "-display", "none", "-monitor", "none"]);
         match (boot, self.arch) {
-            (Boot::Direct, _) => {
+            (Boot::Direct | Boot::DirectAmongParcels, _) => {
                 qemu.arg("-kernel")
                     .arg(out.join("vmlinuz"))
                     .arg("-initrd")
                     .arg(out.join("initramfs"));
-                qemu.args(["-append", "console=ttyS0 console=ttyAMA0 quiet panic=5"]);
+                let first = if boot == Boot::Direct { 0 } else { PARCELS_IN_VIEW };
+                let line = format!("console=ttyS0 console=ttyAMA0 quiet panic=5 hil.first={first}");
+                qemu.arg("-append").arg(line);
             }
             (Boot::Uefi, Arch::X86) => {
                 let code = "/usr/share/OVMF/OVMF_CODE_4M.fd";

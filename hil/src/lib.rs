@@ -1,6 +1,7 @@
 //! Hardware in the loop without hardware: the real binary, and peers that the project did not
 //! write. Here is what its tests share; the tests are in `hil/tests`.
 
+pub mod allocations;
 pub mod appliance;
 pub mod can_peer;
 pub mod machine;

@@ -1,38 +1,18 @@
 //! Our receiver of GigE cameras, and Aravis when it is built in, against Aravis's fake camera, which
 //! we did not write: the same tests for both.
-#![allow(unsafe_code)] // a counting allocator cannot be written without
 
 use beltgauge::config::{CameraTable, Interface};
 use beltgauge::plan::Block;
 use beltgauge::source::{Arrival, Driver, Feed, Live, Next, open_camera};
-use std::alloc::{GlobalAlloc, Layout, System};
-use std::cell::Cell;
+use hil::allocations;
 use std::process::{Child, Command, Stdio};
 use std::time::{Duration, Instant};
 
 const SIZE: [usize; 2] = [512, 384];
 const FPS: f64 = 25.0;
 
-thread_local! {
-    static ALLOCATIONS: Cell<u64> = const { Cell::new(0) };
-}
-
-struct Counting;
-
-// SAFETY: everything is passed on to the system's allocator.
-unsafe impl GlobalAlloc for Counting {
-    unsafe fn alloc(&self, layout: Layout) -> *mut u8 {
-        // A thread that ends has no counter any more.
-        let _ = ALLOCATIONS.try_with(|count| count.set(count.get() + 1));
-        unsafe { System.alloc(layout) }
-    }
-    unsafe fn dealloc(&self, pointer: *mut u8, layout: Layout) {
-        unsafe { System.dealloc(pointer, layout) }
-    }
-}
-
 #[global_allocator]
-static ALLOCATOR: Counting = Counting;
+static ALLOCATOR: allocations::Counting = allocations::Counting;
 
 /// The fake camera, until it is dropped.
 struct Fake(Child);
@@ -118,10 +98,10 @@ fn tally(driver: &mut dyn Driver, frames: u64) -> Tally {
         }
         // The first frames belong to the start.
         if tally.whole == 5 && before.is_none() {
-            before = Some(ALLOCATIONS.get());
+            before = Some(allocations::count());
         }
     }
-    tally.allocations = before.map_or(0, |before| ALLOCATIONS.get() - before);
+    tally.allocations = before.map_or(0, |before| allocations::count() - before);
     assert!(numbers.is_sorted_by(|a, b| a < b), "in order");
     let (first, last) = (numbers.first(), numbers.last());
     let span = last.zip(first).map_or(0, |(last, first)| last - first + 1);

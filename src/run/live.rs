@@ -51,9 +51,14 @@ pub fn run(options: &Options<'_>) -> Result<()> {
     let (appliance, imports) = Appliance::new(site)?.supervised(watchdog);
     tracing::info!("measuring; Modbus TCP on {listen}");
     tell(&imports, store.last_import());
+    let mut seen = false;
     let mut kept_at: Option<Instant> = None;
     let progress = appliance.run(&mut feed, |progress, records| {
         records.for_each(|record| log(&record));
+        if !seen && progress.status.counters.frames > 0 {
+            seen = true;
+            tracing::info!("the first frame was processed");
+        }
         if kept_at.is_none_or(|at| at.elapsed() >= HOUSEKEEPING) {
             kept_at = Some(Instant::now());
             can.try_now();

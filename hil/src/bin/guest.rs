@@ -5,6 +5,7 @@
 use beltgauge::config::CameraTable;
 use beltgauge::plan::Block;
 use beltgauge::source::{Arrival, open_camera};
+use hil::allocations;
 use nix::sys::ptrace;
 use nix::sys::wait::{WaitPidFlag, WaitStatus, waitpid};
 use nix::unistd::Pid;
@@ -18,14 +19,19 @@ use v4l::v4l_sys::{
 use v4l::v4l2::vidioc;
 use v4l::{Device, control};
 
+#[global_allocator]
+static ALLOCATOR: allocations::Counting = allocations::Counting;
+
 const USAGE: &str =
-    "guest feed DEVICE RECORDING | freeze PID THREAD | formats DEVICE | press DEVICE CONTROL";
+    "guest feed DEVICE RECORDING FIRST | freeze PID THREAD | formats DEVICE | press DEVICE CONTROL";
 
 fn main() {
     let arguments: Vec<String> = std::env::args().skip(1).collect();
     let words: Vec<&str> = arguments.iter().map(String::as_str).collect();
     match words[..] {
-        ["feed", device, recording] => feed(device, recording),
+        ["feed", device, recording, first] => {
+            feed(device, recording, first.parse().expect("a frame"));
+        }
         ["freeze", pid, thread] => freeze(pid, thread),
         ["formats", device] => formats(device),
         ["press", device, name] => press(device, name),
@@ -53,8 +59,8 @@ fn now_s() -> f64 {
 }
 
 /// Play a Y4M recording into a loopback device, over and over, every frame stamped with the time at
-/// which it was due.
-fn feed(device: &str, recording: &str) {
+/// which it was due; the first time from a frame on.
+fn feed(device: &str, recording: &str, first: usize) {
     let mut file = BufReader::new(File::open(recording).expect("the recording is there"));
     let mut header = String::new();
     file.read_line(&mut header).expect("Y4M");
@@ -93,9 +99,11 @@ fn feed(device: &str, recording: &str) {
     ioctl(&device, vidioc::VIDIOC_STREAMON, &mut (kind as i32));
     let (start_s, mut image) = (now_s(), vec![0; width * height]);
     let header_bytes = header.len() as u64;
+    let frame_bytes = (width * height + "FRAME\n".len()) as u64;
     for n in 0.. {
-        if n % frames == 0 {
-            std::io::Seek::seek(&mut file, std::io::SeekFrom::Start(header_bytes)).expect("a file");
+        if n == 0 || (n + first).is_multiple_of(frames) {
+            let at = header_bytes + ((n + first) % frames) as u64 * frame_bytes;
+            std::io::Seek::seek(&mut file, std::io::SeekFrom::Start(at)).expect("a file");
         }
         let mut line = String::new();
         file.read_line(&mut line).expect("FRAME");
@@ -165,14 +173,18 @@ fn formats(device: &str) {
         settings.controls.insert("osd_text_mode".into(), 2.into());
         let mut driver = open_camera(&settings, SIZE).unwrap_or_else(|e| panic!("{format}: {e}"));
         let (mut buffer, start) = (Block::own(SIZE[0] * SIZE[1]).expect("small"), Instant::now());
-        let (mut frames, mut last) = (0, None);
+        let (mut frames, mut last, mut allocated) = (0, None, 0);
         while frames < 10 {
             assert!(start.elapsed() < Duration::from_mins(1), "{format}: no frames");
             if let Arrival::Frame { sequence, stride, .. } = driver.next(&mut buffer).expect(format)
             {
                 assert!(last.is_none_or(|last| sequence > last), "{format}: numbers rise");
                 (last, frames) = (Some(sequence), frames + 1);
+                if frames == 3 {
+                    allocated = allocations::count();
+                }
                 if frames == 10 {
+                    assert_eq!(allocations::count(), allocated, "{format}: allocations for frames");
                     return buffer
                         .chunks(stride)
                         .take(SIZE[1])
