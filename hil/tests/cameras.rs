@@ -186,6 +186,20 @@ fn what_the_camera_does_not_do_is_named() {
 }
 
 #[test]
+fn packets_have_the_size_of_the_configuration() {
+    let _fake = Fake::start(0);
+    for (interface, device) in interfaces() {
+        let mut settings = settings(interface, device);
+        for bytes in [576, 1500, 9000] {
+            settings.packet_bytes = Some(bytes);
+            let mut driver = open_camera(&settings, SIZE).expect("it takes them");
+            let tally = tally(&mut *driver, 30);
+            assert!(tally.whole > 20 && tally.torn == 0, "{interface:?} {bytes}: {tally:?}");
+        }
+    }
+}
+
+#[test]
 fn features_are_set_in_the_order_of_the_configuration() {
     let _fake = Fake::start(0);
     for (interface, device) in interfaces() {
