@@ -266,9 +266,10 @@ fn a_new_system_is_tried_and_kept_and_a_broken_one_falls_back() {
     assert!(entry.starts_with("beltgauge-1") && !list.contains("beltgauge-2"), "{entry} {list}");
     appliance.wait("it runs", "frames", |frames| frames > 5);
     let boots = appliance.status("boots");
-    // The same system again is a new one, too.
+    // The same system with some bytes more is a new one.
     let image = bench.site("new", SiteOptions::default()).join("beltgauge.efi");
-    std::fs::copy(bench.system(), &image).expect("room");
+    let system_bytes = std::fs::read(bench.system()).expect("made");
+    std::fs::write(&image, [&system_bytes[..], &[0; 512]].concat()).expect("room");
     let stick = bench.stick("update", std::slice::from_ref(&image));
     appliance.plug(&stick);
     appliance.ready();
@@ -285,7 +286,7 @@ fn a_new_system_is_tried_and_kept_and_a_broken_one_falls_back() {
     let (_, list) = system(&mut appliance);
     assert!(list.contains("beltgauge-2.efi") && !list.contains('+'), "{list}");
     // A system whose initramfs is rubbish: the kernel finds no first process.
-    let mut broken = std::fs::read(bench.system()).expect("made");
+    let mut broken = system_bytes;
     let from = broken.len() - 4_000_000;
     broken[from..].fill(0x55);
     std::fs::write(&image, broken).expect("room");

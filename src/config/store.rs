@@ -12,6 +12,8 @@
 use crate::error::{Error, Result};
 use rustix::fs::{FlockOperation, flock};
 use serde::{Deserialize, Serialize};
+use std::collections::BTreeMap;
+use std::ffi::OsString;
 use std::fs::{self, File};
 use std::io::{ErrorKind, Write};
 use std::os::unix::fs::symlink;
@@ -109,6 +111,20 @@ impl Locked<'_> {
         let made = remove(&staging).and_then(|()| fs::create_dir(&staging));
         made.map_err(|e| self.store.failed(&e))?;
         Ok(staging)
+    }
+
+    /// Whether what was staged is in force already.
+    pub fn is_in_force(&self) -> bool {
+        let contents = |folder: &str| -> std::io::Result<BTreeMap<OsString, Vec<u8>>> {
+            let entries = fs::read_dir(self.store.root.join(folder))?;
+            let file = |entry: std::io::Result<fs::DirEntry>| {
+                let entry = entry?;
+                Ok((entry.file_name(), fs::read(entry.path())?))
+            };
+            entries.map(file).collect()
+        };
+        let [staged, current] = [STAGING, CURRENT].map(contents);
+        staged.is_ok_and(|staged| current.is_ok_and(|current| staged == current))
     }
 
     /// Put what was staged in force.
@@ -249,6 +265,12 @@ mod tests {
             import(&store, text);
         }
         assert_eq!(current(&store).as_deref(), Some("c"));
+        for (text, same) in [("c", true), ("b", false)] {
+            let locked = store.lock().expect("free");
+            let staging = locked.stage().expect("room");
+            fs::write(staging.join(CONFIG_FILE), text).expect("room");
+            assert_eq!(locked.is_in_force(), same);
+        }
         let locked = store.lock().expect("free");
         assert!(store.lock().is_err(), "one at a time");
         assert_eq!(locked.sites().expect("readable").len(), 2);

@@ -55,7 +55,9 @@ impl Board {
 pub fn import(root: &Path, store: &Store) -> Result<String> {
     let locked = store.lock()?;
     let mut report = String::new();
-    let result = stage(root, store, &locked, &mut report).and_then(|()| locked.apply());
+    // A stick that stays plugged in is imported at every start: what is in force already stays.
+    let result = stage(root, store, &locked, &mut report)
+        .and_then(|()| if locked.is_in_force() { Ok(()) } else { locked.apply() });
     match &result {
         Ok(()) => report.push_str("The configuration is in force.\n"),
         Err(e) => {

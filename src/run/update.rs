@@ -36,6 +36,11 @@ pub fn update(root: &Path, store: &Store, to: &Path) -> Result<String> {
             .remedy("the boot partition needs room for two systems")
     };
     let systems = systems(to).map_err(failed)?;
+    // A stick that stays plugged in must not be an update at every start.
+    let same = |system: &&System| fs::read(&system.path).is_ok_and(|bytes| bytes == image);
+    if let Some(system) = systems.iter().find(same) {
+        return Ok(format!("it is there already, as {}.\n", system.path.display()));
+    }
     let kept = systems.iter().filter(|s| !s.on_trial).max_by_key(|s| s.number);
     let kept_path = kept.map(|system| &system.path);
     for system in systems.iter().filter(|system| Some(&system.path) != kept_path) {
@@ -123,6 +128,11 @@ mod tests {
             .collect();
         names.sort();
         assert_eq!(names, ["beltgauge-3.efi", "beltgauge-5+3.efi", "beltgauge-x.efi"]);
+        let again = update(&stick, &store, &boot).expect("fits");
+        assert!(
+            again.contains("there already") && !boot.join("beltgauge-6+3.efi").exists(),
+            "{again}"
+        );
         assert_eq!(fs::read(boot.join("beltgauge-5+3.efi")).expect("there"), pe(MACHINE));
     }
 }

@@ -8,9 +8,10 @@ use std::path::Path;
 use std::sync::atomic::{AtomicU64, Ordering};
 use std::time::{Duration, Instant};
 
-/// A thread that stands still for this long hangs: longer than any wait of its own, opening a
-/// camera that does not answer included.
+/// A thread that stands still for this long hangs: longer than any wait of its own.
 const PATIENCE: Duration = Duration::from_secs(10);
+/// The same for capture: opening a camera over a bad cable takes many requests of half a second.
+const CAPTURE_PATIENCE: Duration = Duration::from_secs(40);
 /// The hardware watchdog is fed this often; it bites after some 10 to 60 s, as its driver says.
 const FEEDING: Duration = Duration::from_secs(1);
 /// The process's exit status when a thread hangs.
@@ -83,13 +84,17 @@ impl Watchdog {
 
     /// The name of a thread that has not beaten for too long.
     fn hanging(&mut self, beats: &Beats, now: Instant) -> Option<&'static str> {
-        let threads = [("capture", &beats.capture), ("vision", &beats.vision), ("PLC", &beats.plc)];
+        let threads = [
+            ("capture", &beats.capture, CAPTURE_PATIENCE),
+            ("vision", &beats.vision, PATIENCE),
+            ("PLC", &beats.plc, PATIENCE),
+        ];
         let mut hanging = None;
-        for ((name, beat), seen) in threads.into_iter().zip(&mut self.seen) {
+        for ((name, beat, patience), seen) in threads.into_iter().zip(&mut self.seen) {
             let count = beat.0.load(Ordering::Relaxed);
             match seen {
                 Some((last, at)) if *last == count => {
-                    if now.saturating_duration_since(*at) > PATIENCE {
+                    if now.saturating_duration_since(*at) > patience {
                         hanging = Some(name);
                     }
                 }
