@@ -7,7 +7,10 @@
 use crate::error::{Error, Result};
 use crate::plan::Block;
 use std::time::{Duration, Instant};
-use viva_genicam::gige::{GvspContent, GvspHeader, PacketBitmap, parse_header, parse_packet_ref};
+use viva_genicam::gige::{
+    GVSP_EXTENDED_HEADER_SIZE, GvspContent, GvspHeader, PacketBitmap, parse_header,
+    parse_packet_ref,
+};
 
 /// A packet that is missing is asked for when so long nothing has come.
 pub const PATIENCE: Duration = Duration::from_millis(4);
@@ -90,6 +93,10 @@ struct Slot {
     /// The block that is under way here.
     block: Option<u64>,
     extended: bool,
+    /// Bytes of the image in a packet, which are fewer behind a header with long numbers.
+    payload: usize,
+    /// Leader and payload packets of the block.
+    packets: usize,
     stamp: u64,
     began: Instant,
     /// When something of it came or was asked for.
@@ -100,9 +107,8 @@ struct Slot {
 /// Frames under way.
 pub struct Assembly {
     slots: [Slot; SLOTS],
-    payload: usize,
-    /// Leader and payload packets of a block.
-    packets: usize,
+    image_bytes: usize,
+    datagram_bytes: usize,
     size_px: [usize; 2],
     /// The newest block begun, its number, and whether blocks have 64 bits.
     newest: Option<(u64, u64)>,
@@ -110,23 +116,33 @@ pub struct Assembly {
 }
 
 impl Assembly {
-    /// For images of so many bytes in packets of so many.
-    pub fn new(image_bytes: usize, payload: usize, size_px: [usize; 2]) -> Result<Self> {
-        let packets = 1 + image_bytes.div_ceil(payload);
+    /// For images of so many bytes in datagrams of so many, stream header included.
+    pub fn new(image_bytes: usize, datagram_bytes: usize, size_px: [usize; 2]) -> Result<Self> {
+        let packets_max = 1 + image_bytes
+            .div_ceil(datagram_bytes.saturating_sub(GVSP_EXTENDED_HEADER_SIZE).max(1));
         let slot = || -> Result<Slot> {
             let now = Instant::now();
             Ok(Slot {
                 image: Block::own(image_bytes)?,
-                came: PacketBitmap::new(packets),
+                came: PacketBitmap::new(packets_max),
                 block: None,
                 extended: false,
+                payload: 1,
+                packets: 0,
                 stamp: 0,
                 began: now,
                 touched: now,
                 rounds: 0,
             })
         };
-        Ok(Self { slots: [slot()?, slot()?], payload, packets, size_px, newest: None, resends: 0 })
+        Ok(Self {
+            slots: [slot()?, slot()?],
+            image_bytes,
+            datagram_bytes,
+            size_px,
+            newest: None,
+            resends: 0,
+        })
     }
 
     /// The image of a slot, until the next packet.
@@ -169,8 +185,8 @@ impl Assembly {
                 slot.came.set(0);
             }
             GvspContent::Payload(bytes) => {
-                let at = (header.packet_id as usize).wrapping_sub(1).saturating_mul(self.payload);
-                let room = slot.image.len().saturating_sub(at).min(self.payload);
+                let at = (header.packet_id as usize).wrapping_sub(1).saturating_mul(slot.payload);
+                let room = slot.image.len().saturating_sub(at).min(slot.payload);
                 // A packet shorter than its place is none of this stream.
                 if room > 0 && bytes.len() >= room && slot.came.set(header.packet_id as usize) {
                     slot.image[at..at + room].copy_from_slice(&bytes[..room]);
@@ -178,7 +194,7 @@ impl Assembly {
             }
             GvspContent::Trailer(_) | GvspContent::Unsupported { .. } | _ => {}
         }
-        if slot.came.received() == self.packets {
+        if slot.came.received() == slot.packets {
             let sequence = self.sequence_of(header.block_id, header.extended_ids);
             let slot = &mut self.slots[index];
             slot.block = None;
@@ -204,7 +220,9 @@ impl Assembly {
         let free = self.slots.iter().position(|slot| slot.block.is_none());
         let index = free.unwrap_or_else(|| usize::from(self.slots[1].began < self.slots[0].began));
         let slot = &mut self.slots[index];
-        slot.came.reset(self.packets);
+        slot.payload = self.datagram_bytes.saturating_sub(header.header_len).max(1);
+        slot.packets = 1 + self.image_bytes.div_ceil(slot.payload);
+        slot.came.reset(slot.packets);
         (slot.block, slot.extended, slot.rounds) = (Some(id), header.extended_ids, 0);
         (slot.began, slot.touched) = (now, now);
         Some((index, free.is_none()))
@@ -233,7 +251,7 @@ impl Assembly {
             slot.rounds += 1;
             slot.touched = now;
             let mut from = 0;
-            while let Some([first, last]) = missing(&slot.came, self.packets, from) {
+            while let Some([first, last]) = missing(&slot.came, slot.packets, from) {
                 from = last as usize + 1;
                 if resends.push(Resend::new(block, [first, last], slot.extended)).is_err() {
                     break;
@@ -266,9 +284,11 @@ mod tests {
     use super::*;
 
     const SIZE: [usize; 2] = [100, 30];
-    const PAYLOAD: usize = 64;
+    const DATAGRAM: usize = 72;
     /// 3000 bytes in packets of 64, and the leader.
     const PACKETS: u32 = 1 + 47;
+    /// The same in packets of 52, behind longer headers.
+    const EXTENDED_PACKETS: u32 = 1 + 58;
 
     fn image(block: u64) -> Vec<u8> {
         (0..3000u32).map(|i| (i as u8).wrapping_mul(7).wrapping_add(block as u8)).collect()
@@ -276,9 +296,10 @@ mod tests {
 
     /// The packets of a block as a camera sends them: leader, payload, trailer.
     fn packet(block: u64, id: u32, extended: bool) -> Vec<u8> {
+        let (payload, packets) = if extended { (52, EXTENDED_PACKETS) } else { (64, PACKETS) };
         let format = match id {
             0 => 1,
-            id if id < PACKETS => 3,
+            id if id < packets => 3,
             _ => 2,
         };
         let mut bytes = vec![0, 0];
@@ -301,8 +322,8 @@ mod tests {
                 bytes.extend([0; 12]);
             }
             3 => {
-                let from = (id as usize - 1) * PAYLOAD;
-                bytes.extend(&image(block)[from..3000.min(from + PAYLOAD)]);
+                let from = (id as usize - 1) * payload;
+                bytes.extend(&image(block)[from..3000.min(from + payload)]);
             }
             _ => {
                 bytes.extend([0, 0, 0, 1]);
@@ -313,7 +334,7 @@ mod tests {
     }
 
     fn assembly() -> Assembly {
-        Assembly::new(3000, PAYLOAD, SIZE).expect("small")
+        Assembly::new(3000, DATAGRAM, SIZE).expect("small")
     }
 
     /// Feed packets; returns what came of them but [`Step::More`].
@@ -326,7 +347,8 @@ mod tests {
     fn packets_in_any_order_and_twice_make_the_image() {
         let (mut assembly, now) = (assembly(), Instant::now());
         for (block, extended) in [(1, false), (2, false), (70_000, true), (70_001, true)] {
-            let mut packets: Vec<_> = (0..=PACKETS).map(|id| packet(block, id, extended)).collect();
+            let last = if extended { EXTENDED_PACKETS } else { PACKETS };
+            let mut packets: Vec<_> = (0..=last).map(|id| packet(block, id, extended)).collect();
             packets.reverse();
             packets.swap(3, 40);
             packets.insert(9, packets[5].clone());
@@ -414,7 +436,7 @@ mod tests {
     #[test]
     fn another_size_is_an_error_and_rubbish_is_ignored() {
         let (mut assembly, now) =
-            (Assembly::new(3000, PAYLOAD, [50, 60]).expect("small"), Instant::now());
+            (Assembly::new(3000, DATAGRAM, [50, 60]).expect("small"), Instant::now());
         let error = assembly.packet(&packet(1, 0, false), now).expect_err("100 x 30").to_string();
         assert!(error.contains("100 x 30 px, asked for were 50 x 60 px"), "{error}");
         let mut bytes: Vec<u8> = Vec::new();

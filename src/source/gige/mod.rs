@@ -26,8 +26,8 @@ const DISCOVERY: Duration = Duration::from_millis(500);
 const WAIT: Duration = Duration::from_millis(200);
 /// Packets that wait in the kernel: nearly two frames of the reference camera.
 const SOCKET_BYTES: usize = 4 << 20;
-/// The IP, UDP and stream headers of a packet.
-const HEADERS: u32 = 36;
+/// The IP and UDP headers of a packet.
+const HEADERS: u32 = 28;
 /// Packets of a network without jumbo frames.
 const PACKET_BYTES: u32 = 1500;
 /// The camera must not split packets.
@@ -100,8 +100,8 @@ impl Gige {
         };
         let [width, height] = size_px;
         let image_bytes = format.row_bytes(width) * height;
-        let payload = (packet_bytes - HEADERS) as usize;
-        let assembly = Assembly::new(image_bytes, payload, size_px)?;
+        let datagram_bytes = (packet_bytes - HEADERS) as usize;
+        let assembly = Assembly::new(image_bytes, datagram_bytes, size_px)?;
         camera.acquisition_start().map_err(|e| failed("cannot start the camera", e))?;
         let datagram = vec![0; packet_bytes as usize];
         let heard = Instant::now();
@@ -122,6 +122,10 @@ impl Gige {
     fn receive(&mut self, until: Instant) -> Result<Step> {
         let lost = |e: std::io::Error| failed("the camera is lost", e);
         loop {
+            // Also in a flood of what is none of ours.
+            if Instant::now() >= until {
+                return Ok(Step::More);
+            }
             match self.socket.recv_from(&mut self.datagram) {
                 // Whoever else sends to this port is not listened to.
                 Ok((_, from)) if from.ip() != self.address => {}
@@ -140,10 +144,7 @@ impl Gige {
                     if step != Step::More {
                         return Ok(step);
                     }
-                    if now >= until {
-                        return Ok(Step::More);
-                    }
-                    let wait = (until - now).min(assembly::PATIENCE);
+                    let wait = until.saturating_duration_since(now).min(assembly::PATIENCE);
                     wait_readable(&self.socket, wait).map_err(lost)?;
                 }
                 // What a datagram of ours met on the way: the camera is asked below.
