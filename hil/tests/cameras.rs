@@ -133,7 +133,8 @@ fn frames_are_whole_or_torn_and_none_is_unaccounted_for() {
             assert!(lost as f64 <= 0.05 * all, "{tally:?}");
             if interface == Interface::Gige {
                 assert_eq!(tally.allocations, 0, "nothing is allocated for a frame");
-                assert_eq!(resends > 0, per_mille > 0);
+                // On a busy machine the camera pauses within a frame, and is asked without need.
+                assert!(resends > 0 || per_mille == 0, "{tally:?}");
             }
         }
     }

@@ -213,5 +213,14 @@ fn formats(device: &str) {
         println!("{format} {correlation:.5}");
         assert!(correlation > 0.999, "{format}");
     }
+    // What the driver does not do is named, not taken for something else.
+    for (format, size, said) in
+        [("GREY", [641, 361], "asked for were GREY of 641 x 361 px"), ("MJPG", SIZE, "its formats")]
+    {
+        let mut settings = CameraTable::new("camera.toml".into());
+        (settings.device, settings.format) = (Some(device.to_owned()), Some(format.to_owned()));
+        let error = open_camera(&settings, size).err().expect("refused").to_string();
+        assert!(error.contains(said), "{error}");
+    }
     println!("all formats");
 }
