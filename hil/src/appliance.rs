@@ -164,6 +164,27 @@ impl Bench {
         self.out.join(format!("beltgauge-{}.efi", self.arch.name()))
     }
 
+    /// A system whose program writes what a working one writes, and crashes every three seconds.
+    ///
+    /// # Panics
+    /// When it cannot be made.
+    pub fn crashing_system(&self) -> PathBuf {
+        let script = r#"set -euo pipefail
+            rm -rf crashing && cp -r "$1" crashing
+            rm crashing/bin/beltgauge
+            printf '#!/bin/sh\nfor s in 1 2 3; do\necho "{\"camera_absent\":false,\"frames\":$(date +%%s)}" >/run/beltgauge/status.json\nsleep 1\ndone\nexit 1\n' >crashing/bin/beltgauge
+            chmod +x crashing/bin/beltgauge
+            (cd crashing && find . | cpio --quiet -o -H newc -R 0:0) | xz --check=crc32 -1 >crashing.initrd
+            objcopy --update-section .initrd=crashing.initrd "$2" crashing.efi"#;
+        let root = self.out.join(self.arch.name()).join("root");
+        run(Command::new("bash")
+            .args(["-c", script, "bash"])
+            .arg(root)
+            .arg(self.system())
+            .current_dir(&self.out));
+        self.out.join("crashing.efi")
+    }
+
     /// The binary inside.
     pub fn binary(&self) -> PathBuf {
         self.out.join(self.arch.name()).join("root/bin/beltgauge")
@@ -185,12 +206,29 @@ impl Bench {
     /// # Panics
     /// When it does not start.
     pub fn boot(&self, disk: &Path, boot: Boot) -> Appliance {
+        self.boot_with(disk, boot, None)
+    }
+
+    /// The same with a stick in it at power-on.
+    ///
+    /// # Panics
+    /// When it does not start.
+    pub fn boot_with(&self, disk: &Path, boot: Boot, stick: Option<&Path>) -> Appliance {
         let free = TcpListener::bind("127.0.0.1:0").expect("a free port");
         let modbus = free.local_addr().expect("bound");
         drop(free);
         let name = disk.file_stem().expect("a name").to_string_lossy().into_owned();
         let qmp = self.out.join(format!("{name}.qmp"));
-        let shell = Shell::start(self.qemu(disk, &name, boot, modbus, &qmp));
+        let mut qemu = self.qemu(disk, &name, boot, modbus, &qmp);
+        if let Some(stick) = stick {
+            let node = format!(
+                "driver=raw,node-name=stick,file.driver=file,file.filename={}",
+                stick.display()
+            );
+            qemu.arg("-blockdev").arg(node);
+            qemu.args(["-device", "usb-storage,id=stick,drive=stick,removable=true"]);
+        }
+        let shell = Shell::start(qemu);
         shell.ready();
         let qmp = Qmp::connect(&qmp);
         Appliance { shell, qmp, modbus }
@@ -228,7 +266,7 @@ impl Bench {
                 qemu.args(["-chardev", "stdio,id=shell", "-device", "pci-serial,chardev=shell"]);
             }
         }
-        qemu.args(["-m", "768", "-display", "none", "-monitor", "none"]);
+        qemu.args(["-m", "512", "-display", "none", "-monitor", "none"]);
         match (boot, self.arch) {
             (Boot::Direct | Boot::DirectAmongParcels, _) => {
                 qemu.arg("-kernel")

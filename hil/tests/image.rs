@@ -72,6 +72,8 @@ fn parcels_arrive_with_their_true_sizes_and_both_buses_work() {
     // NET_BIND_SERVICE 10, NET_ADMIN 12, IPC_LOCK 14, SYS_NICE 23.
     let capabilities = 1u64 << 10 | 1 << 12 | 1 << 14 | 1 << 23;
     assert!(status.contains(&format!("{capabilities:016x}")), "{status}");
+    // What root runs, only root may write.
+    assert_eq!(appliance.run("stat -c '%u %a' /data /data/start").trim(), "0 755\n0 644");
     let file = appliance.run("cat /run/beltgauge/status.json");
     assert!(file.contains(r#""camera_absent":false"#), "{file}");
     // From power to the first frame, beside what the kernel itself takes: on hardware a kernel needs
@@ -139,7 +141,8 @@ fn a_camera_that_is_unplugged_is_told_and_comes_back() {
         appliance.wait("all is well", "reason", |reason| reason == 0);
     }
     // Every format that a driver may deliver; the appliance lets the device go.
-    appliance.run("mv /data/current /data/gone; kill -TERM $(pidof beltgauge); sleep 3");
+    appliance
+        .run("mv /data/store/current /data/store/gone; kill -TERM $(pidof beltgauge); sleep 3");
     let formats = appliance.run("/tmp/hil/guest formats /dev/video1");
     println!("{formats}");
     assert!(formats.contains("all formats"));
@@ -204,7 +207,7 @@ fn sticks_bring_configurations_and_bad_ones_change_nothing() {
     assert_eq!((appliance.status("imports"), appliance.status("scale_interval")), (imports, 20));
     // And back to the one before.
     appliance.run(
-        "beltgauge import --user 100 --store /data --roll-back && kill -TERM $(pidof beltgauge)",
+        "beltgauge import --user 100 --store /data/store --roll-back && kill -TERM $(pidof beltgauge)",
     );
     appliance.wait("the one before", "scale_interval", |mm| mm == 1);
     appliance.wait("it is told", "import_result", |result| result == 3);
@@ -255,7 +258,7 @@ fn a_new_system_is_tried_and_kept_and_a_broken_one_falls_back() {
     let bench = bench();
     let mut appliance = bench.boot(&bench.disk("update"), Boot::Uefi);
     let system = |appliance: &mut Appliance| {
-        appliance.run("mount -t vfat -o ro $(findfs LABEL=BG-BOOT) /boot");
+        appliance.run("mount -t vfat -o ro $(partition BG-BOOT) /boot");
         let list = appliance.run("ls /boot/EFI/Linux");
         appliance.run("umount /boot");
         let entry = appliance
@@ -305,6 +308,66 @@ fn a_new_system_is_tried_and_kept_and_a_broken_one_falls_back() {
     );
     assert!(entry.starts_with("beltgauge-2"), "{entry} {list}");
     assert!(list.contains("beltgauge-3+0-3.efi"), "it was tried three times: {list}");
+}
+
+#[test]
+fn a_new_system_that_crashes_again_and_again_is_not_kept() {
+    let bench = bench();
+    let mut appliance = bench.boot(&bench.disk("crashing"), Boot::Uefi);
+    appliance.wait("the old system runs", "frames", |frames| frames > 5);
+    let image = bench.site("crash", SiteOptions::default()).join("beltgauge.efi");
+    std::fs::copy(bench.crashing_system(), &image).expect("room");
+    appliance.plug(&bench.stick("crashing-update", &[image]));
+    appliance.ready();
+    appliance.pull();
+    // Longer than what a working one needs to be kept.
+    std::thread::sleep(Duration::from_secs(45));
+    let status = appliance.run("cat /run/beltgauge/status.json; pidof beltgauge || true");
+    assert!(status.contains("frames"), "it does what a working one does: {status}");
+    assert!(!appliance.run("dmesg").contains("is kept"));
+    appliance.run("mount -t vfat -o ro $(partition BG-BOOT) /boot");
+    let list = appliance.run("ls /boot/EFI/Linux");
+    assert!(list.contains("beltgauge-2+2-1.efi"), "{list}");
+}
+
+#[test]
+fn a_stick_that_is_in_at_power_on_needs_its_signature_too() {
+    let bench = bench();
+    let key = "RWQf6LRCGA9i53mlYecO4IzT51TGPpvWucNSCh1CBM0QTaLn73Y7GFO3";
+    let options = SiteOptions { scale_interval_mm: 2.0, ..SiteOptions::default() };
+    let locked = bench.site("locked", options);
+    let config = locked.join("beltgauge.toml");
+    let text = std::fs::read_to_string(&config).expect("written");
+    std::fs::write(&config, format!("{text}[import]\npublic_key = \"{key}\"\n")).expect("room");
+    let disk = bench.disk("locked");
+    let mut appliance = bench.boot(&disk, Boot::Direct);
+    appliance.wait("it runs", "frames", |frames| frames > 0);
+    appliance.plug(&bench.stick("locked", &files(&locked)));
+    appliance.wait("the key is in force", "scale_interval", |mm| mm == 20);
+    appliance.run("sync");
+    drop(appliance);
+    // Unsigned, both of them.
+    let folder = bench.site("unsigned", SiteOptions::default());
+    let image = folder.join("beltgauge.efi");
+    std::fs::copy(bench.system(), &image).expect("room");
+    let mut contents = files(&folder);
+    // Another one than the running.
+    std::fs::OpenOptions::new()
+        .append(true)
+        .open(&image)
+        .and_then(|mut file| std::io::Write::write_all(&mut file, &[0; 512]))
+        .expect("room");
+    contents.push(image);
+    let stick = bench.stick("unsigned", &contents);
+    let mut appliance = bench.boot_with(&disk, Boot::Direct, Some(&stick));
+    appliance.wait("it is refused", "imports", |imports| imports == 2);
+    assert_eq!((appliance.status("import_result"), appliance.status("scale_interval")), (2, 20));
+    appliance.run("mount -t vfat -o ro $(partition BG-BOOT) /boot");
+    assert_eq!(appliance.run("ls /boot/EFI/Linux").trim(), "beltgauge-1.efi");
+    appliance.run("umount /boot");
+    pull(&mut appliance);
+    let said = report(&stick);
+    assert_eq!(said.matches("minisig is not there").count(), 2, "{said}");
 }
 
 #[test]

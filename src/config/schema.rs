@@ -90,9 +90,17 @@ pub struct CameraTable {
     pub gain: Option<f64>,
     /// GigE packets, headers included; none given: 1500 bytes.
     pub packet_bytes: Option<u32>,
+    /// A camera that sends no frame for this long is opened again; 0: never, for one with a trigger.
+    #[serde(default = "frame_timeout_s")]
+    pub frame_timeout_s: f64,
     /// Other controls by the driver's or GenICam's name, set in this order, trigger for one.
     #[serde(default)]
     pub controls: toml::Table,
+}
+
+/// Longer than any pause of a camera that runs free.
+fn frame_timeout_s() -> f64 {
+    5.0
 }
 
 impl CameraTable {
@@ -107,6 +115,7 @@ impl CameraTable {
             exposure_us: None,
             gain: None,
             packet_bytes: None,
+            frame_timeout_s: frame_timeout_s(),
             controls: toml::Table::new(),
         }
     }
@@ -120,6 +129,7 @@ impl CameraTable {
         ] {
             value.map_or(Ok(()), |value| range(key, value, min, max, unit))?;
         }
+        range("camera.frame_timeout_s", self.frame_timeout_s, 0.0, 3600.0, "s")?;
         for (name, value) in &self.controls {
             if value.is_table() || value.is_array() || value.is_datetime() {
                 return Err(Error::configuration(format!("camera.controls.{name} = {value}"))

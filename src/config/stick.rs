@@ -17,6 +17,8 @@ const SIGNATURE: &str = "minisig";
 pub const TEXT_BYTES_MAX: u64 = 256 << 10;
 /// Largest still.
 pub const STILL_BYTES_MAX: u64 = 64 << 20;
+/// All stills of a folder together.
+pub const STILLS_BYTES_MAX: u64 = 192 << 20;
 /// Most stills of a folder.
 pub const STILLS_MAX: usize = 60;
 /// Most entries of a folder that are looked at.

@@ -3,7 +3,9 @@
 use super::calibrate;
 use crate::camera::LensModel;
 use crate::camera::chessboard::Chessboard;
-use crate::config::stick::{self, STILL_BYTES_MAX, STILLS_MAX, Stick, is_plain_name};
+use crate::config::stick::{
+    self, STILL_BYTES_MAX, STILLS_BYTES_MAX, STILLS_MAX, Stick, is_plain_name,
+};
 use crate::config::store::{CONFIG_FILE, ImportResult, Locked, REPORT, Store};
 use crate::config::{Config, Site};
 use crate::error::{Error, Result};
@@ -223,8 +225,10 @@ impl Scratch {
             Error::failure(format!("cannot copy the stills: {e}")).in_file(&folder)
         };
         std::fs::create_dir(&folder).map_err(failed)?;
+        let mut room = STILLS_BYTES_MAX;
         for still in &names {
-            let bytes = from.read(still, STILL_BYTES_MAX)?;
+            let bytes = from.read(still, STILL_BYTES_MAX.min(room))?;
+            room -= bytes.len() as u64;
             std::fs::write(folder.join(still), bytes).map_err(failed)?;
         }
         Ok(vec![folder])

@@ -43,7 +43,7 @@ pub fn run(options: &Options<'_>) -> Result<()> {
     if options.config.is_none() {
         site.config.plc.state_file.get_or_insert_with(|| store.plc_state());
     }
-    let mut can = CanSetUp { settings: site.config.can.clone(), done: false, complaint: None };
+    let mut can = CanSetUp { settings: site.config.can.clone(), done: None, complaint: None };
     let camera = site.config.camera.clone();
     let mut feed = Live::new(camera, site.camera.image_size_px, open_camera);
     let listen = site.config.modbus.listen;
@@ -73,20 +73,22 @@ pub fn run(options: &Options<'_>) -> Result<()> {
     Ok(())
 }
 
-/// The CAN interface, which may be plugged in later than the power.
+/// The CAN interface, which may be plugged in later than the power, and again.
 struct CanSetUp {
     settings: Can,
-    done: bool,
+    /// The kernel's number of the interface that was set up.
+    done: Option<u32>,
     complaint: Option<String>,
 }
 
 impl CanSetUp {
     fn try_now(&mut self) {
-        if self.done {
+        let index = interface::index(&self.settings);
+        if index.is_some() && index == self.done {
             return;
         }
         match interface::set_up(&self.settings) {
-            Ok(()) => self.done = true,
+            Ok(()) => self.done = index,
             Err(e) => {
                 // Once, not every second.
                 let complaint = Some(e.to_string());

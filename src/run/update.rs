@@ -8,13 +8,13 @@ use crate::config::stick::Stick;
 use crate::config::store::Store;
 use crate::error::{Error, Result};
 use std::fs::{self, File};
-use std::io::Write;
+use std::io::{Read, Write};
 use std::path::{Path, PathBuf};
 
 /// Name of the system on the stick.
 const IMAGE: &str = "beltgauge.efi";
-/// Largest system.
-const IMAGE_BYTES_MAX: u64 = 128 << 20;
+/// Largest system: two of them fit the boot partition.
+const IMAGE_BYTES_MAX: u64 = 60 << 20;
 /// How often a new system is tried.
 const TRIALS: u32 = 3;
 /// Machine types of PE files (Microsoft's PE format, 3.3.1).
@@ -37,9 +37,16 @@ pub fn update(root: &Path, store: &Store, to: &Path) -> Result<String> {
     };
     let systems = systems(to).map_err(failed)?;
     // A stick that stays plugged in must not be an update at every start.
-    let same = |system: &&System| fs::read(&system.path).is_ok_and(|bytes| bytes == image);
+    let same = |system: &&System| has_contents(&system.path, &image).unwrap_or(false);
     if let Some(system) = systems.iter().find(same) {
-        return Ok(format!("it is there already, as {}.\n", system.path.display()));
+        let place = system.path.display();
+        return if system.is_tried_out {
+            Err(Error::configuration("this system was tried before and did not work")
+                .in_file(&system.path)
+                .remedy("build another; to try the same again, remove that file at the console"))
+        } else {
+            Ok(format!("it is there already, as {place}.\n"))
+        };
     }
     let kept = systems.iter().filter(|s| !s.on_trial).max_by_key(|s| s.number);
     let kept_path = kept.map(|system| &system.path);
@@ -59,6 +66,23 @@ pub fn update(root: &Path, store: &Store, to: &Path) -> Result<String> {
     Ok(format!("{name} is tried at the next start.\n"))
 }
 
+/// Whether a file has these contents, without holding them twice.
+fn has_contents(path: &Path, bytes: &[u8]) -> std::io::Result<bool> {
+    let mut file = File::open(path)?;
+    if file.metadata()?.len() != bytes.len() as u64 {
+        return Ok(false);
+    }
+    let mut part = vec![0; 1 << 20];
+    for expected in bytes.chunks(part.len()) {
+        let part = &mut part[..expected.len()];
+        file.read_exact(part)?;
+        if part != expected {
+            return Ok(false);
+        }
+    }
+    Ok(true)
+}
+
 /// The machine that a PE file is for.
 fn machine(image: &[u8]) -> Option<u16> {
     let at = image.get(0x3c..0x40).filter(|_| image.starts_with(b"MZ"))?;
@@ -72,6 +96,8 @@ struct System {
     number: u64,
     /// It has a counter of trials in its name.
     on_trial: bool,
+    /// Its trials are used up.
+    is_tried_out: bool,
 }
 
 fn systems(folder: &Path) -> std::io::Result<Vec<System>> {
@@ -85,8 +111,10 @@ fn systems(folder: &Path) -> std::io::Result<Vec<System>> {
         };
         let (number, trials) = rest.split_once('+').map_or((rest, None), |(n, t)| (n, Some(t)));
         let on_trial = trials.is_some();
+        // "+LEFT-DONE".
+        let is_tried_out = trials.is_some_and(|trials| trials.split('-').next() == Some("0"));
         if let Ok(number) = number.parse() {
-            systems.push(System { path, number, on_trial });
+            systems.push(System { path, number, on_trial, is_tried_out });
         }
     }
     Ok(systems)
@@ -133,6 +161,10 @@ mod tests {
             again.contains("there already") && !boot.join("beltgauge-6+3.efi").exists(),
             "{again}"
         );
+        fs::rename(boot.join("beltgauge-5+3.efi"), boot.join("beltgauge-5+0-3.efi")).expect("room");
+        let error = update(&stick, &store, &boot).expect_err("was tried").to_string();
+        assert!(error.contains("did not work") && error.contains("beltgauge-5+0-3.efi"), "{error}");
+        fs::rename(boot.join("beltgauge-5+0-3.efi"), boot.join("beltgauge-5+3.efi")).expect("room");
         assert_eq!(fs::read(boot.join("beltgauge-5+3.efi")).expect("there"), pe(MACHINE));
     }
 }

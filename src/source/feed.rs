@@ -188,6 +188,8 @@ pub struct Live {
     open: Open,
     driver: Option<Box<dyn Driver>>,
     retry_at: Instant,
+    /// When it was opened, or a frame came.
+    heard: Instant,
     timeline: Timeline,
     status: FeedStatus,
     complaint: String,
@@ -202,6 +204,7 @@ impl Live {
             open,
             driver: None,
             retry_at: Instant::now(),
+            heard: Instant::now(),
             timeline: Timeline::default(),
             status: FeedStatus { absent: true, ..FeedStatus::default() },
             complaint: String::new(),
@@ -220,11 +223,13 @@ impl Live {
             self.retry_at = now + RETRY;
             match (self.open)(&self.settings, self.size_px) {
                 Ok(driver) => {
-                    tracing::info!("the camera is there");
-                    self.complaint.clear();
-                    self.status.absent = false;
+                    self.heard = now;
                     self.timeline.reopened();
                     self.driver = Some(driver);
+                    if self.settings.frame_timeout_s <= 0.0 {
+                        // It waits for its trigger.
+                        self.is_there();
+                    }
                 }
                 Err(error) => self.complain(&error),
             }
@@ -241,11 +246,33 @@ impl Live {
         }
     }
 
+    /// Something came of it.
+    fn is_there(&mut self) {
+        self.heard = Instant::now();
+        if self.status.absent {
+            tracing::info!("the camera is there");
+            self.complaint.clear();
+            self.status.absent = false;
+        }
+    }
+
+    /// A camera may be open and yet send nothing, or nothing that becomes a frame.
+    fn check_silence(&mut self) {
+        let timeout_s = self.settings.frame_timeout_s;
+        if timeout_s > 0.0 && self.heard.elapsed().as_secs_f64() > timeout_s {
+            self.lose(
+                &Error::failure(format!("the camera is open, and no frame came for {timeout_s} s"))
+                    .remedy("check its trigger, or set camera.frame_timeout_s to 0 if it has one"),
+            );
+        }
+    }
+
     fn lose(&mut self, error: &Error) {
         self.complain(error);
         self.driver = None;
+        // One that never sent anything was not lost.
+        self.status.losses += u64::from(!self.status.absent);
         self.status.absent = true;
-        self.status.losses += 1;
         self.retry_at = Instant::now() + RETRY;
     }
 }
@@ -268,11 +295,18 @@ impl Feed for Live {
         match driver.next(buffer) {
             Ok(Arrival::Frame { sequence, stamp_s, captured, stride }) => {
                 self.status.resends += self.driver.as_ref().map_or(0, |d| d.resends()) - resends;
+                self.is_there();
                 let time = self.timeline.frame(sequence, stamp_s, captured);
                 Ok(Next::Frame(Taken { time, captured, stride }))
             }
-            Ok(Arrival::Torn) => Ok(Next::Torn),
-            Ok(Arrival::Nothing) => Ok(Next::Nothing),
+            Ok(Arrival::Torn) => {
+                self.is_there();
+                Ok(Next::Torn)
+            }
+            Ok(Arrival::Nothing) => {
+                self.check_silence();
+                Ok(Next::Nothing)
+            }
             Err(error) => {
                 self.lose(&error);
                 Ok(Next::Nothing)
@@ -443,8 +477,37 @@ mod tests {
                 }
                 next != Next::End
             }));
-            assert_eq!(live.status().absent, live.driver.is_none());
         }
         assert_eq!((indices, live.status().losses), (vec![0, 1, 2, 3, 4, 5], 1));
+        assert!(!live.status().absent);
+        let _ = live.next(&mut buffer);
+        assert!(live.status().absent && live.driver.is_none());
+    }
+
+    /// A camera that opens and sends nothing.
+    struct Silent;
+
+    impl Driver for Silent {
+        fn next(&mut self, _: &mut Block<u8>) -> Result<Arrival> {
+            std::thread::sleep(Duration::from_millis(10));
+            Ok(Arrival::Nothing)
+        }
+
+        fn skip(&mut self) -> Result<bool> {
+            Ok(false)
+        }
+    }
+
+    #[test]
+    fn a_camera_that_is_open_and_silent_is_opened_again_unless_it_waits_for_a_trigger() {
+        let mut buffer = Block::own(16).expect("small");
+        for (frame_timeout_s, absent) in [(0.05, true), (0.0, false)] {
+            let mut settings = CameraTable::new("camera.toml".into());
+            settings.frame_timeout_s = frame_timeout_s;
+            let mut live = Live::new(settings, [4, 4], |_, _| Ok(Box::new(Silent)));
+            (0..20).for_each(|_| assert_eq!(live.next(&mut buffer).ok(), Some(Next::Nothing)));
+            let status = live.status();
+            assert_eq!((status.absent, live.driver.is_none(), status.losses), (absent, absent, 0));
+        }
     }
 }

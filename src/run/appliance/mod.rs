@@ -43,6 +43,8 @@ const COUNT_RING: usize = 128;
 const REQUEST_RING: usize = 16;
 /// How long a thread sleeps when a ring is empty and nobody has woken it.
 const PARK: Duration = Duration::from_millis(50);
+/// The ends of the threads are looked for this often.
+const ENDING: Duration = Duration::from_millis(5);
 /// The last parcels reach disk and CAN bus within this, or not at all.
 const FAREWELL: Duration = Duration::from_secs(1);
 /// An encoder that moves faster than the belt's nominal speed by this factor was set anew.
@@ -236,8 +238,9 @@ impl Appliance {
                     break;
                 }
             }
-            // In the order of the flow, so that every frame and record arrives.
+            // They end in the order of the flow, so that every frame and record arrives.
             shared.stop.store(true, Ordering::Relaxed);
+            watch_the_end([&capture, &vision, &plc], &mut watchdog, &shared.beats);
             let captured = join(capture);
             let seen = join(vision);
             let served = join(plc);
@@ -270,6 +273,20 @@ fn spawn<'scope, 'env>(
         .name(name.to_owned())
         .spawn_scoped(scope, body)
         .map_err(|e| Error::failure(format!("cannot start the {name} thread: {e}")))
+}
+
+/// Watch the threads until all have ended.
+fn watch_the_end(threads: [&Handle<'_>; 3], watchdog: &mut Watchdog, beats: &Beats) {
+    while !threads.iter().all(|thread| thread.is_finished()) {
+        for (thread, beat) in threads.iter().zip([&beats.capture, &beats.vision, &beats.plc]) {
+            // One that has ended does not hang.
+            if thread.is_finished() {
+                beat.beat();
+            }
+        }
+        watchdog.look(beats);
+        std::thread::sleep(ENDING);
+    }
 }
 
 /// Wait for a thread; a panic in it is a broken invariant and goes on here.
