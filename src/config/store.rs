@@ -62,7 +62,7 @@ pub struct Store {
 /// The right to change the store; one process has it.
 pub struct Locked<'a> {
     store: &'a Store,
-    _lock: File,
+    lock: File,
 }
 
 impl Store {
@@ -94,13 +94,20 @@ impl Store {
         flock(&lock, FlockOperation::NonBlockingLockExclusive).map_err(|_| {
             Error::failure("another import is at work").in_file(&self.root).remedy("wait for it")
         })?;
-        Ok(Locked { store: self, _lock: lock })
+        Ok(Locked { store: self, lock })
     }
 
     fn failed(&self, e: &std::io::Error) -> Error {
         Error::failure(format!("the store of configurations cannot be written: {e}"))
             .in_file(&self.root)
             .remedy("give a folder on a disk with room that the process may write, with --store")
+    }
+}
+
+impl Drop for Locked<'_> {
+    /// Closing is not enough: a child between its fork and its exec has the file open too.
+    fn drop(&mut self) {
+        let _ = flock(&self.lock, FlockOperation::Unlock);
     }
 }
 
@@ -280,6 +287,16 @@ mod tests {
         }
         let record = ImportRecord { count: 3, result: ImportResult::Applied };
         assert_eq!(store.last_import(), record);
+    }
+
+    #[test]
+    fn a_child_that_still_has_the_lock_open_does_not_hold_it() {
+        let store = store("child");
+        let locked = store.lock().expect("free");
+        let inherited = locked.lock.try_clone().expect("as fork does");
+        drop(locked);
+        store.lock().expect("free");
+        drop(inherited);
     }
 
     #[test]
