@@ -316,10 +316,18 @@ impl Feed for Live {
 
     fn skip(&mut self) -> Result<u64> {
         let Some(driver) = self.driver() else { return Ok(0) };
-        driver.skip().map(u64::from).or_else(|error| {
-            self.lose(&error);
-            Ok(0)
-        })
+        match driver.skip() {
+            Ok(skipped) => {
+                if skipped {
+                    self.is_there();
+                }
+                Ok(u64::from(skipped))
+            }
+            Err(error) => {
+                self.lose(&error);
+                Ok(0)
+            }
+        }
     }
 
     fn status(&self) -> FeedStatus {
@@ -484,7 +492,7 @@ mod tests {
         assert!(live.status().absent && live.driver.is_none());
     }
 
-    /// A camera that opens and sends nothing.
+    /// A camera that opens and sends nothing but what is skipped.
     struct Silent;
 
     impl Driver for Silent {
@@ -494,7 +502,7 @@ mod tests {
         }
 
         fn skip(&mut self) -> Result<bool> {
-            Ok(false)
+            Ok(true)
         }
     }
 
@@ -509,5 +517,20 @@ mod tests {
             let status = live.status();
             assert_eq!((status.absent, live.driver.is_none(), status.losses), (absent, absent, 0));
         }
+    }
+
+    #[test]
+    fn a_camera_whose_frames_are_skipped_is_not_silent() {
+        let mut buffer = Block::own(16).expect("small");
+        let mut settings = CameraTable::new("camera.toml".into());
+        settings.frame_timeout_s = 0.5;
+        let mut live = Live::new(settings, [4, 4], |_, _| Ok(Box::new(Silent)));
+        let _ = live.next(&mut buffer);
+        for _ in 0..12 {
+            std::thread::sleep(Duration::from_millis(50));
+            assert_eq!(live.skip().ok(), Some(1));
+        }
+        let _ = live.next(&mut buffer);
+        assert!(live.driver.is_some() && !live.status().absent);
     }
 }
