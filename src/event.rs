@@ -15,7 +15,7 @@ impl Flags {
     pub const MERGED: Self = Self(1 << 1);
     /// It reached over the side of the zone; parts outside are not used.
     pub const CLIPPED: Self = Self(1 << 2);
-    /// The height's standard deviation is above 3 mm.
+    /// The height's standard deviation is above `measure.sigma_max_mm`.
     pub const HEIGHT_UNCERTAIN: Self = Self(1 << 3);
     /// The belt speed was assumed, not measured, for most of the pass.
     pub const SPEED_ASSUMED: Self = Self(1 << 4);
@@ -23,7 +23,7 @@ impl Flags {
     pub const LOST: Self = Self(1 << 5);
     /// Taller than `view.height_max_mm`: nothing of it can be trusted.
     pub const TOO_TALL: Self = Self(1 << 7);
-    /// The standard deviation of length or width is above 3 mm.
+    /// The standard deviation of length or width is above `measure.sigma_max_mm`.
     pub const FOOTPRINT_UNCERTAIN: Self = Self(1 << 8);
     /// Too few edges were found: size from the silhouette alone.
     pub const SILHOUETTE_ONLY: Self = Self(1 << 6);
@@ -40,7 +40,11 @@ impl Flags {
             "clipped",
             "it reached over the side of the zone; parts outside are not used",
         ),
-        (Self::HEIGHT_UNCERTAIN, "height_uncertain", "standard deviation of the height above 3 mm"),
+        (
+            Self::HEIGHT_UNCERTAIN,
+            "height_uncertain",
+            "standard deviation of the height above measure.sigma_max_mm",
+        ),
         (Self::SPEED_ASSUMED, "speed_assumed", "belt speed assumed, not measured: trust no height"),
         (Self::LOST, "lost", "it vanished inside the zone"),
         (
@@ -52,7 +56,7 @@ impl Flags {
         (
             Self::FOOTPRINT_UNCERTAIN,
             "footprint_uncertain",
-            "standard deviation of length or width above 3 mm",
+            "standard deviation of length or width above measure.sigma_max_mm",
         ),
         (
             Self::HEIGHT_DISPUTED,
@@ -77,6 +81,11 @@ impl Flags {
     pub fn bits(self) -> u16 {
         self.0
     }
+
+    /// Whether there is no doubt.
+    pub fn is_empty(self) -> bool {
+        self.0 == 0
+    }
 }
 
 impl fmt::Display for Flags {
@@ -91,8 +100,13 @@ impl fmt::Display for Flags {
     }
 }
 
+/// By name where people read them. As bits on the disk of an appliance, where a flag that a later
+/// version of the program has added is kept as it is.
 impl serde::Serialize for Flags {
     fn serialize<S: Serializer>(&self, serializer: S) -> Result<S::Ok, S::Error> {
+        if !serializer.is_human_readable() {
+            return self.0.serialize(serializer);
+        }
         let mut seq = serializer.serialize_seq(None)?;
         for (_, name, _) in Self::ALL.iter().filter(|(flag, ..)| self.has(*flag)) {
             seq.serialize_element(name)?;
@@ -103,6 +117,9 @@ impl serde::Serialize for Flags {
 
 impl<'de> serde::Deserialize<'de> for Flags {
     fn deserialize<D: Deserializer<'de>>(deserializer: D) -> Result<Self, D::Error> {
+        if !deserializer.is_human_readable() {
+            return u16::deserialize(deserializer).map(Self);
+        }
         let mut flags = Self::default();
         for name in <Vec<String> as serde::Deserialize>::deserialize(deserializer)? {
             let known = Self::ALL.iter().find(|(_, known, _)| *known == name);
@@ -123,8 +140,43 @@ pub enum Shape {
     Irregular,
 }
 
-/// One parcel, as it is reported: once, when it leaves the zone. Field order is that of the
-/// JSON line.
+/// Why a parcel has no dimensions.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, serde::Serialize, serde::Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum NotMeasured {
+    /// Seen in too few frames or over too little travel.
+    TooBrief = 1,
+    /// Its image was never apart from another's.
+    NeverAlone = 2,
+    /// It vanished inside the zone before its edges could be measured.
+    Lost = 3,
+    /// The belt's motion was not known while it passed.
+    BeltMotionUnknown = 4,
+}
+
+impl NotMeasured {
+    /// Every reason: its name in records and its meaning. The code is the reason's number.
+    pub const ALL: [(Self, &'static str, &'static str); 4] = [
+        (Self::TooBrief, "too_brief", "seen in too few frames or over too little travel"),
+        (Self::NeverAlone, "never_alone", "its image was never apart from another's"),
+        (Self::Lost, "lost", "it vanished inside the zone before its edges could be measured"),
+        (
+            Self::BeltMotionUnknown,
+            "belt_motion_unknown",
+            "the belt's motion was not known while it passed",
+        ),
+    ];
+}
+
+impl fmt::Display for NotMeasured {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        let name = Self::ALL.iter().find(|(reason, ..)| reason == self).map(|(_, name, _)| *name);
+        f.write_str(name.unwrap_or_default())
+    }
+}
+
+/// One parcel, as it is reported: once, when it leaves the zone, measured or not. Field order is
+/// that of the JSON line.
 #[derive(Clone, Copy, Debug, PartialEq, serde::Serialize, serde::Deserialize)]
 pub struct ParcelRecord {
     /// From 1, never skips.
@@ -157,6 +209,11 @@ pub struct ParcelRecord {
     pub shape: Shape,
     /// Doubts.
     pub flags: Flags,
+    /// Why it has no dimensions; they are 0 then, and the position is that of its image on the belt.
+    pub not_measured: Option<NotMeasured>,
+    /// The dimensions may be used: measured, without a doubt, and every standard deviation within
+    /// `measure.sigma_max_mm`.
+    pub may_be_used: bool,
     /// Belt travel since start at `frame`: where the parcel is later, follows from it.
     pub belt_travel_mm: f64,
     /// The belt's motion was told by the encoder when it left.
@@ -214,7 +271,11 @@ impl fmt::Display for ParcelRecord {
             self.y_mm,
             self.shape,
             self.flags
-        )
+        )?;
+        match self.not_measured {
+            Some(reason) => write!(f, " not measured: {reason}"),
+            None => Ok(()),
+        }
     }
 }
 
@@ -223,10 +284,12 @@ impl fmt::Display for ParcelRecord {
 pub struct Counters {
     /// Frames processed.
     pub frames: u64,
-    /// Parcels reported.
+    /// Parcels reported, measured or not.
     pub parcels: u64,
-    /// Parcels that left without a size: seen too briefly or never alone.
+    /// Of these, parcels without dimensions.
     pub unmeasured: u64,
+    /// Things that left and were too small to be a parcel: slivers of shadow or light.
+    pub slivers: u64,
     /// Parcels that vanished inside the view.
     pub lost: u64,
     /// Frames with more runs or blobs than the tables hold.
@@ -241,7 +304,7 @@ impl fmt::Display for Counters {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         write!(
             f,
-            "{} frames, {} parcels reported, {} unmeasured, {} lost",
+            "{} frames, {} parcels reported ({} unmeasured, {} lost)",
             self.frames, self.parcels, self.unmeasured, self.lost
         )?;
         let overflows = self.segment_overflows + self.track_overflows + self.event_overflows;

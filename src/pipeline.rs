@@ -7,7 +7,7 @@
 use crate::belt::BeltPosition;
 use crate::config::Site;
 use crate::error::{Error, Result};
-use crate::event::{Counters, Flags, ParcelRecord, Shape};
+use crate::event::{Counters, Flags, NotMeasured, ParcelRecord, Shape};
 use crate::image::{FrameTime, Plane};
 use crate::kernel::Level;
 use crate::kernel::scalar::bits::{self, Square, words};
@@ -18,11 +18,9 @@ use crate::stage::odometry::{Motion, Odometry};
 use crate::stage::rectify::Rectify;
 use crate::stage::segment::{PxBox, Segment};
 use crate::stage::track::{Change, NOBODY, Phase, Track, Tracker};
-use crate::units::{BeltPx, BeltRect};
+use crate::units::{BeltMm, BeltPx, BeltRect};
 use nalgebra::Vector2;
 
-/// Above this sigma a dimension is flagged.
-const SIGMA_MAX_MM: f64 = 3.0;
 /// Above this relative sigma the belt speed counts as assumed.
 const SPEED_SIGMA_MAX: f64 = 0.01;
 /// Around a parcel this many px are not learned as background: its blurred border.
@@ -348,22 +346,73 @@ impl Pipeline {
             return;
         }
         let reference = self.references[slot];
+        let had_shape = self.measure.outline(slot, self.at).is_some();
         let measured = self.measure.finish(slot, reference.at);
-        // A pass that was cut short counts only if it could be measured.
-        let measured = measured.filter(|m| m.has_edges || flags == Flags::default());
         // A sliver of shadow or light is smaller than the smallest blob that counts.
         let area_min_mm2 = self.site.config.segment.area_min_mm2;
-        let measured = measured.filter(|m| {
+        let is_sliver = |m: &Measured| {
             let p = &m.estimate.params;
-            p[measure::LENGTH] * p[measure::WIDTH] >= area_min_mm2
-        });
-        let Some(measured) = measured else {
-            self.counters.unmeasured += 1;
-            return;
+            p[measure::LENGTH] * p[measure::WIDTH] < area_min_mm2
         };
+        if measured.as_ref().is_some_and(is_sliver) {
+            self.counters.slivers += 1;
+            return;
+        }
+        // A pass that was cut short counts only if edges were found.
+        let measured = measured.filter(|m| m.has_edges || flags == Flags::default());
+        // What vanished before it had a shape was a hand, or a piece that joined its parcel.
+        if measured.is_none() && flags.has(Flags::LOST) && !had_shape {
+            return;
+        }
         self.counters.parcels += 1;
-        let record = self.record(slot, &measured, reference, flags);
-        emit(record);
+        self.counters.unmeasured += u64::from(measured.is_none());
+        let record = match measured {
+            Some(measured) => self.record(slot, &measured, reference, flags),
+            None => self.record_without_size(slot, flags),
+        };
+        emit(record.rounded());
+    }
+
+    /// Where the middle of a track's image lies on the belt.
+    fn image_on_belt(&self, slot: usize) -> BeltMm {
+        let b = &self.tracker.tracks()[slot].bounds;
+        let middle = BeltPx { u: f64::from(b.u0 + b.u1) / 2.0, v: f64::from(b.v0 + b.v1) / 2.0 };
+        self.site.view.belt_point(middle)
+    }
+
+    /// Where a parcel is that could not be measured, and why.
+    fn record_without_size(&self, slot: usize, flags: Flags) -> ParcelRecord {
+        let track = &self.tracker.tracks()[slot];
+        let position = self.image_on_belt(slot);
+        let reason = if flags.has(Flags::LOST) {
+            NotMeasured::Lost
+        } else if track.was_merged() {
+            NotMeasured::NeverAlone
+        } else {
+            NotMeasured::TooBrief
+        };
+        let now = self.last.unwrap_or(FrameTime { index: 0, t_s: 0.0 });
+        ParcelRecord {
+            seq: self.counters.parcels as u32,
+            frame: now.index,
+            t_s: now.t_s,
+            length_mm: 0.0,
+            width_mm: 0.0,
+            height_mm: 0.0,
+            yaw_deg: 0.0,
+            x_mm: position.x,
+            y_mm: position.y,
+            sigma_length_mm: 0.0,
+            sigma_width_mm: 0.0,
+            sigma_height_mm: 0.0,
+            belt_speed_mm_per_s: self.belt_motion().0,
+            shape: Shape::Irregular,
+            flags,
+            not_measured: Some(reason),
+            may_be_used: false,
+            belt_travel_mm: self.at.travel_mm,
+            by_encoder: self.by_encoder(),
+        }
     }
 
     fn record(
@@ -395,27 +444,36 @@ impl Pipeline {
             belt_speed_mm_per_s: p[measure::SCALE] * travel_mm / elapsed_s.max(1e-9),
             shape,
             flags,
+            not_measured: None,
+            may_be_used: false,
             belt_travel_mm: reference.at.travel_mm,
             by_encoder: self.by_encoder(),
         };
+        let sigma_max_mm = self.site.config.measure.sigma_max_mm;
         record.flags.set(Flags::MERGED, track.was_merged());
         record.flags.set(Flags::CLIPPED, self.reaches_out(p));
-        record.flags.set(Flags::HEIGHT_UNCERTAIN, record.sigma_height_mm > SIGMA_MAX_MM);
+        record.flags.set(Flags::HEIGHT_UNCERTAIN, record.sigma_height_mm > sigma_max_mm);
         let footprint_sigma_mm = record.sigma_length_mm.max(record.sigma_width_mm);
-        record.flags.set(Flags::FOOTPRINT_UNCERTAIN, footprint_sigma_mm > SIGMA_MAX_MM);
+        record.flags.set(Flags::FOOTPRINT_UNCERTAIN, footprint_sigma_mm > sigma_max_mm);
         record.flags.set(Flags::SPEED_ASSUMED, travel_sigma > SPEED_SIGMA_MAX);
         record.flags.set(Flags::TOO_TALL, record.height_mm > self.site.height_max_mm);
         record.flags.set(Flags::SILHOUETTE_ONLY, !measured.has_edges);
         record.flags.set(Flags::HEIGHT_DISPUTED, measured.disputed);
-        record.rounded()
+        // A standard deviation above the limit is a flag too.
+        record.may_be_used = record.flags.is_empty();
+        record
     }
 
-    /// Whether nothing of a measured parcel was in the zone.
+    /// Whether nothing of a parcel was in the zone.
     fn passed_beside(&self, slot: usize) -> bool {
-        self.measure.outline(slot, self.at).is_some_and(|outline| {
-            let y = outline.base.map(|v| v.over_belt.y);
-            y.iter().all(|&y| y < self.zone.y_min_mm) || y.iter().all(|&y| y > self.zone.y_max_mm)
-        })
+        let beside = |y_mm: &[f64]| {
+            y_mm.iter().all(|&y| y < self.zone.y_min_mm)
+                || y_mm.iter().all(|&y| y > self.zone.y_max_mm)
+        };
+        match self.measure.outline(slot, self.at) {
+            Some(outline) => beside(&outline.base.map(|v| v.over_belt.y)),
+            None => beside(&[self.image_on_belt(slot).y]),
+        }
     }
 
     /// Whether a cuboid reaches over the side of the zone, where nothing of it is used.

@@ -120,6 +120,8 @@ pub fn record(number: u32) -> ParcelRecord {
         belt_speed_mm_per_s: 500.0,
         shape: Shape::Box,
         flags: Flags::default(),
+        not_measured: None,
+        may_be_used: true,
         belt_travel_mm: 0.0,
         by_encoder: false,
     }

@@ -226,11 +226,13 @@ impl Default for Odometry {
 pub struct Measure {
     /// Radius of a parcel's edges: rounded edges appear inside of the outer size.
     pub edge_radius_mm: f64,
+    /// Dimensions may be used when every standard deviation is at most this.
+    pub sigma_max_mm: f64,
 }
 
 impl Default for Measure {
     fn default() -> Self {
-        Self { edge_radius_mm: 1.2 }
+        Self { edge_radius_mm: 1.2, sigma_max_mm: 3.0 }
     }
 }
 
@@ -490,6 +492,7 @@ impl Config {
         range("segment.area_min_mm2", segment.area_min_mm2, 1.0, 1e6, "mm2")?;
         range("odometry.speed_error_max", odometry.speed_error_max, 0.0, 0.2, "")?;
         range("measure.edge_radius_mm", measure.edge_radius_mm, 0.0, 20.0, "mm")?;
+        range("measure.sigma_max_mm", measure.sigma_max_mm, 0.1, 100.0, "mm")?;
         count("limits.memory_mib_max", limits.memory_mib_max, 1, 16_384)?;
         count("limits.tracks_max", limits.tracks_max, 1, 256)?;
         count("limits.runs_max", limits.runs_max, 256, 1 << 20)?;

@@ -8,7 +8,7 @@ use super::registers::{
     PARCEL_STRIDE, QUEUE_HEAD, REASONS, RING, RING_PARCELS, STATUS_FIELDS,
 };
 use super::table::Field;
-use crate::event::Flags;
+use crate::event::{Flags, NotMeasured};
 use std::fmt::Write;
 
 fn version(version: u16) -> String {
@@ -73,8 +73,9 @@ pub fn markdown() -> String {
          `sequence_end` are equal. With `plc.queue` the oldest parcel that was not acknowledged is at {QUEUE_HEAD}\n\
          (`sequence` 0: none); writing the low word of its sequence number to `acknowledge` brings the next.\n\
          Up to {RING_PARCELS} wait; one more, and the oldest goes and is counted in `queue_overflows`.\n\
-         A parcel without a size gets no sequence number; `parcels_unmeasured`\n\
-         counts it. Where a parcel is now: x + (status `belt_travel` - its own `belt_travel`), the difference\n\
+         **Sort by the dimensions only when bit 0 of `valid` is set**: they were measured, nothing casts doubt on them,\n\
+         and every standard deviation is within `measure.sigma_max_mm`. A parcel that could not be measured is in the\n\
+         queue like any other: with its position, the reason in `not_measured`, dimensions 0 and that bit off. Where a parcel is now: x + (status `belt_travel` - its own `belt_travel`), the difference\n\
          taken in 32 bits, so that it survives the wrap.\n\
          Addresses below are of the latest parcel.\n"
     );
@@ -82,6 +83,12 @@ pub fn markdown() -> String {
     text.push_str("\n## Flags of a parcel\n\n| bit | flag | meaning |\n|---|---|---|\n");
     for (flag, name, meaning) in Flags::ALL {
         let _ = writeln!(text, "| {} | {name} | {meaning} |", flag.bits().trailing_zeros());
+    }
+    text.push_str(
+        "\n## Why a parcel was not measured\n\n| code | name | meaning |\n|---|---|---|\n",
+    );
+    for (reason, name, meaning) in NotMeasured::ALL {
+        let _ = writeln!(text, "| {} | {name} | {meaning} |", reason as u8);
     }
     can(&mut text);
     text

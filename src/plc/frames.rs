@@ -232,7 +232,7 @@ mod tests {
     #[test]
     fn a_parcel_in_segments_is_headed_by_its_sequence_number() {
         let frames = frames(|emit| parcel(&record(0x1_2345), false, emit));
-        assert_eq!(frames[0].payload[..], [0x45, 0, 0, 1, 0x23, 0x45, 0, 3]);
+        assert_eq!(frames[0].payload[..], [0x45, 0, 0, 1, 0x23, 0x45, 0, 0b1011]);
         // flags, length, width
         assert_eq!(frames[1].payload[..], [0x45, 1, 0, 0, 0x09, 0x2f, 0x04, 0xe0]);
         for (i, frame) in frames.iter().enumerate() {

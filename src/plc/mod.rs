@@ -35,6 +35,8 @@ fn record(seq: u32) -> crate::event::ParcelRecord {
         belt_speed_mm_per_s: 500.3,
         shape: crate::event::Shape::Box,
         flags: crate::event::Flags::default(),
+        not_measured: None,
+        may_be_used: true,
         belt_travel_mm: 1712.5,
         by_encoder: false,
     }

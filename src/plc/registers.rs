@@ -12,8 +12,9 @@ use crate::event::{Counters, ParcelRecord, Shape};
 const V1_0: u16 = 0x0100;
 const V1_1: u16 = 0x0101;
 const V1_2: u16 = 0x0102;
+const V2_0: u16 = 0x0200;
 /// The current one.
-pub const MAP_VERSION: u16 = V1_2;
+pub const MAP_VERSION: u16 = V2_0;
 /// Address of the registers that a PLC writes, and their number.
 pub const COMMAND: u16 = 60;
 /// Registers that a PLC writes.
@@ -259,7 +260,7 @@ pub const STATUS_FIELDS: &[StatusField] = fields![
     [15, V1_0, "frames", U32, "", 1.0, "frames processed; wraps", |s| wrapped(s.vision.counters.frames)],
     [17, V1_0, "frames_dropped", U32, "", 1.0, "frames that came too late; wraps", |s| wrapped(s.vision.frames_dropped)],
     [19, V1_0, "parcels", U32, "", 1.0, "sequence number of the latest parcel", |s| f64::from(s.sequence)],
-    [21, V1_0, "parcels_unmeasured", U32, "", 1.0, "parcels that left without a size", |s| wrapped(s.vision.counters.unmeasured)],
+    [21, V1_0, "parcels_unmeasured", U32, "", 1.0, "of the parcels, those that could not be measured", |s| wrapped(s.vision.counters.unmeasured)],
     [23, V1_0, "parcels_lost", U32, "", 1.0, "parcels that vanished inside the view", |s| wrapped(s.vision.counters.lost)],
     [25, V1_0, "segment_overflows", U32, "", 1.0, "frames with more runs or blobs than the tables hold", |s| wrapped(s.vision.counters.segment_overflows)],
     [27, V1_0, "track_overflows", U32, "", 1.0, "blobs that found no free track", |s| wrapped(s.vision.counters.track_overflows)],
@@ -311,7 +312,7 @@ fn quality(sigma_mm: f64) -> f64 {
 #[rustfmt::skip]
 pub const PARCEL_FIELDS: &[ParcelField] = fields![
     [0, V1_0, "sequence", U32, "", 1.0, "from 1; 0 = no parcel yet", |p| f64::from(p.seq)],
-    [2, V1_0, "valid", U16, "bits", 1.0, "bit 0 the block holds a parcel, bit 1 its shape is a box (else: no cuboid, its height cannot be trusted), bit 2 the encoder told the belt's motion", |p| f64::from(bits([true, p.shape == Shape::Box, p.by_encoder]))],
+    [2, V2_0, "valid", U16, "bits", 1.0, "bit 0 the dimensions may be used: sort by them only then; bit 1 its shape is a box; bit 2 the encoder told the belt's motion; bit 3 it was measured", |p| f64::from(bits([p.may_be_used, p.shape == Shape::Box, p.by_encoder, p.not_measured.is_none()]))],
     [3, V1_0, "flags", U16, "bits", 1.0, "doubts, see below", |p| f64::from(p.flags.bits())],
     [4, V1_0, "length", U16, "mm", 10.0, "longer side of the footprint, or as plc.order says", |p| p.length_mm],
     [5, V1_0, "width", U16, "mm", 10.0, "shorter side of the footprint, or as plc.order says", |p| p.width_mm],
@@ -329,6 +330,7 @@ pub const PARCEL_FIELDS: &[ParcelField] = fields![
     [20, V1_0, "frame", U32, "", 1.0, "frame at which x and y hold; wraps", |p| wrapped(p.frame)],
     [22, V1_0, "time", U32, "ms", 1.0, "time of that frame since start; wraps", |p| wrapped((p.t_s * 1000.0).round() as u64)],
     [24, V1_0, "belt_travel", U32, "mm", 10.0, "belt travel since start at that frame; wraps after 429 km", |p| wrapped_mm(p.belt_travel_mm)],
+    [26, V2_0, "not_measured", U16, "", 1.0, "why it has no dimensions, see below; 0: it has", |p| p.not_measured.map_or(0.0, |reason| f64::from(reason as u8))],
     [30, V1_0, "sequence_end", U32, "", 1.0, "equals sequence unless the block changed between two requests", |p| f64::from(p.seq)],
 ];
 
@@ -415,7 +417,7 @@ mod tests {
         let mut image = RegisterImage::new(WordOrder::HighFirst);
         image.publish(&record(70_000));
         let latest = image.read(LATEST, PARCEL_STRIDE).expect("exists");
-        assert_eq!(latest[..8], [1, 4464, 3, 0, 2351, 1248, 702, (-1240i16) as u16]);
+        assert_eq!(latest[..8], [1, 4464, 0b1011, 0, 2351, 1248, 702, (-1240i16) as u16]);
         assert_eq!(latest[8..12], [0, 610, 0xffff, (-403i16) as u16]);
         assert_eq!(latest[12..18], [30, 25, 750, 94, 95, 0]);
         assert_eq!(latest[18..26], [0, 5003, 0, 137, 0, 3425, 0, 17125]);

@@ -78,18 +78,21 @@ pub fn draw(
         canvas.line(base[k], top[k], SIDE);
         canvas.line(top[k], top[(k + 1) % 4], TOP);
     }
-    let text = format!(
-        "#{} {:?}\nL {:.1} +- {:.1} mm\nW {:.1} +- {:.1} mm\nH {:.1} +- {:.1} mm\n{}",
-        record.seq,
-        record.shape,
-        record.length_mm,
-        record.sigma_length_mm,
-        record.width_mm,
-        record.sigma_width_mm,
-        record.height_mm,
-        record.sigma_height_mm,
-        record.flags
-    );
+    let text = match record.not_measured {
+        Some(reason) => format!("#{}\nnot measured:\n{reason}", record.seq),
+        None => format!(
+            "#{} {:?}\nL {:.1} +- {:.1} mm\nW {:.1} +- {:.1} mm\nH {:.1} +- {:.1} mm\n{}",
+            record.seq,
+            record.shape,
+            record.length_mm,
+            record.sigma_length_mm,
+            record.width_mm,
+            record.sigma_width_mm,
+            record.height_mm,
+            record.sigma_height_mm,
+            record.flags
+        ),
+    };
     let seen = || base.iter().chain(&top).flatten();
     let right = seen().map(|p| p.x).max().unwrap_or(0) + 10;
     let above = seen().map(|p| p.y).min().unwrap_or(0);

@@ -169,6 +169,11 @@ fn table(scenario: &Scenario, records: &[ParcelRecord], progress: &Progress) -> 
             continue;
         };
         let true_size = [parcel.length_mm, parcel.width_mm, parcel.height_mm];
+        if let Some(reason) = r.not_measured {
+            let _ =
+                writeln!(text, "{:3}   {}      not measured: {reason}", r.seq, triple(true_size));
+            continue;
+        }
         let error = [0, 1, 2].map(|i| measured[i] - true_size[i]);
         for e in error.map(f64::abs) {
             sum += e;
