@@ -136,7 +136,8 @@ impl Bench {
         let text = format!(
             "[camera]\ncalibration = \"camera.toml\"\ndevice = \"{device}\"\n{more}\n[zone]\n\
              x_min_mm = -500\nx_max_mm = 500\ny_min_mm = -300\ny_max_mm = 300\n[belt]\n\
-             speed_mm_per_s = 204\n{can}[plc]\nqueue = true\nscale_interval_mm = {scale_interval_mm}\n"
+             speed_mm_per_s = 204\n{can}[plc]\nqueue = true\nscale_interval_mm = {scale_interval_mm}\n\
+             [modbus]\nwrite_allow = [\"0.0.0.0\"]\n"
         );
         std::fs::write(folder.join("beltgauge.toml"), text).expect("room");
         std::fs::write(folder.join("camera.toml"), CAMERA).expect("room");

@@ -150,6 +150,9 @@ pub struct Plc {
     pub taken: Vec<(Parcel, Chute)>,
     /// Errors that a PLC must never see: torn, doubled, out of order, lost.
     pub complaints: Vec<String>,
+    /// The command that is under way: ticket, code, argument. Kept over restarts, as `BeltgaugeCommand`
+    /// of `config/plc.st` does.
+    pub under_way: Option<(u16, u16, u32)>,
     beat: u16,
 }
 
@@ -157,7 +160,7 @@ impl Plc {
     /// Not connected.
     pub fn new(address: SocketAddr) -> Self {
         let (taken, complaints) = (Vec::new(), Vec::new());
-        Self { map: map(), client: None, address, taken, complaints, beat: 0 }
+        Self { map: map(), client: None, address, taken, complaints, under_way: None, beat: 0 }
     }
 
     /// Its cable is pulled, or it loses power: the connection ends without a word.
@@ -185,6 +188,38 @@ impl Plc {
             (true, false) => f64::from(bits as u16 as i16),
         };
         number / register.scale
+    }
+
+    /// One cycle of `BeltgaugeCommand`: gives `command` with the next ticket, or goes on with the one that
+    /// is under way. Returns the result when it is there.
+    ///
+    /// # Errors
+    /// When the connection fails: the next cycle connects anew.
+    pub fn command(&mut self, command: u16, argument: u32) -> std::io::Result<Option<u16>> {
+        let mut client = match self.client.take() {
+            Some(client) => client,
+            None => Client::connect(self.address)?,
+        };
+        let [done_at, ticket_at] =
+            ["status.ticket_done", "command.ticket"].map(|name| self.map[name].address);
+        let done = client.read(done_at, 2)?;
+        let result = match self.under_way {
+            Some((ticket, ..)) if ticket == done[0] => {
+                self.under_way = None;
+                Some(done[1])
+            }
+            Some((ticket, code, argument)) => {
+                let [high, low] = [(argument >> 16) as u16, argument as u16];
+                client.write(ticket_at, &[ticket, code, high, low])?;
+                None
+            }
+            None => {
+                self.under_way = Some((done[0] % 65535 + 1, command, argument));
+                None
+            }
+        };
+        self.client = Some(client);
+        Ok(result)
     }
 
     /// One cycle of the program: heartbeat, at most one parcel. Returns whether there was one.

@@ -40,7 +40,8 @@ impl Server {
     /// # Panics
     /// When it cannot be started.
     pub fn start_with(listen: SocketAddr, state: Option<&Path>, can: Can) -> Self {
-        let settings = Modbus { listen, ..Modbus::default() };
+        let everybody = std::net::Ipv4Addr::UNSPECIFIED.into();
+        let settings = Modbus { listen, write_allow: vec![everybody], ..Modbus::default() };
         let listener = modbus::bind(&settings).expect("a free port");
         let address = listener.local_addr().expect("bound");
         let journal = state.map(|path| Journal::open(path).expect("writable")).unwrap_or_default();

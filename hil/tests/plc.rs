@@ -87,6 +87,94 @@ fn a_thousand_parcels_arrive_once_untorn_in_order_through_reconnects_and_restart
     assert_eq!(boots[0], restarts + 1);
 }
 
+/// Every command acknowledges one parcel more: one that were carried out twice, or not at all, would
+/// show in the queue.
+#[test]
+fn a_command_is_carried_out_once_whatever_restarts() {
+    const COMMANDS: u32 = 60;
+    let state = folder("commands").join("state");
+    let mut server = Server::start(ANY_PORT, Some(&state));
+    let mut plc = Plc::new(server.address);
+    let mut random = Random(11);
+    let (start, mut done, mut restarts) = (Instant::now(), 0, 0);
+    // The scale interval that each command sets is the next one: read back, it tells which was last.
+    while done < COMMANDS {
+        assert!(start.elapsed() < PATIENCE, "{done} of {COMMANDS} commands");
+        if let Ok(Some(result)) = plc.command(5, 1 + done) {
+            assert_eq!(result, 1, "command {done}");
+            done += 1;
+            let set = plc.status("scale_interval").expect("answers");
+            assert_eq!(set, done, "carried out before it is told");
+        }
+        match random.below(5) {
+            0 => {
+                let address = server.address;
+                drop(server);
+                server = Server::start(address, Some(&state));
+                restarts += 1;
+            }
+            1 => {
+                // Its program restarts; what is retained goes on.
+                let under_way = plc.under_way;
+                plc = Plc::new(server.address);
+                plc.under_way = under_way;
+            }
+            _ => {}
+        }
+    }
+    assert!(restarts > 20);
+    let boots = plc.status("boots").expect("answers");
+    assert_eq!(boots, restarts + 1);
+}
+
+#[test]
+fn reading_and_writing_in_one_request_is_the_default_block_of_several_plcs() {
+    let server = Server::start(ANY_PORT, None);
+    server.parcel(1);
+    hil::wait_for("the parcel", || (server.published() == 1).then_some(()));
+    let mut client = Client::connect(server.address).expect("accepted");
+    // 32 registers from 140; the heartbeat to 60.
+    let answer = client.request(&[23, 0, 140, 0, 32, 0, 60, 0, 1, 2, 0, 7]).expect("answered");
+    assert_eq!(answer[..6], [23, 64, 0, 0, 0, 1]);
+    assert_eq!(client.read(60, 1).expect("exists"), [7]);
+}
+
+#[test]
+fn a_plc_that_polls_once_a_second_outlasts_a_thousand_connects_a_second() {
+    let server = Server::start(ANY_PORT, None);
+    let (address, stop) = (server.address, AtomicBool::new(false));
+    let connects = AtomicU64::new(0);
+    let polls = 12;
+    std::thread::scope(|scope| {
+        scope.spawn(|| {
+            let begun = Instant::now();
+            let mut held = std::collections::VecDeque::new();
+            while !stop.load(Ordering::Relaxed) {
+                if let Ok(stream) =
+                    std::net::TcpStream::connect_timeout(&address, Duration::from_secs(1))
+                {
+                    held.push_back(stream);
+                    connects.fetch_add(1, Ordering::Relaxed);
+                }
+                if held.len() > 40 {
+                    held.pop_front();
+                }
+                let due_s = connects.load(Ordering::Relaxed) as f64 / 1000.0;
+                let ahead_s = due_s - begun.elapsed().as_secs_f64();
+                std::thread::sleep(Duration::from_secs_f64(ahead_s.max(0.0)));
+            }
+        });
+        let mut client = Client::connect(address).expect("accepted");
+        for poll in 0..polls {
+            let answered = client.read(100, 32);
+            assert!(answered.is_ok(), "poll {poll}: {answered:?}");
+            std::thread::sleep(Duration::from_secs(1));
+        }
+        stop.store(true, Ordering::Relaxed);
+    });
+    eprintln!("{polls} polls answered beside {} connects", connects.into_inner());
+}
+
 fn plc_register(name: &str) -> u16 {
     hil::plc::map()[name].address
 }

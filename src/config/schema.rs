@@ -354,6 +354,9 @@ pub struct Modbus {
     pub idle_timeout_s: u64,
     /// Only these addresses may connect; none given: all.
     pub allow: Vec<IpAddr>,
+    /// Only these addresses may write: acknowledge, command, tell counts. None given: nobody. The address
+    /// 0.0.0.0 stands for everybody.
+    pub write_allow: Vec<IpAddr>,
     /// Of two-register values.
     pub word_order: WordOrder,
     /// Address of the map's first register.
@@ -367,6 +370,7 @@ impl Default for Modbus {
             connections_max: 16,
             idle_timeout_s: 60,
             allow: Vec::new(),
+            write_allow: Vec::new(),
             word_order: WordOrder::HighFirst,
             base_address: 0,
         }
@@ -509,6 +513,13 @@ impl Config {
         count("modbus.idle_timeout_s", modbus.idle_timeout_s as usize, 1, 86_400)?;
         count("modbus.base_address", usize::from(modbus.base_address), 0, 60_000)?;
         can.check()?;
+        if plc.queue && can.interface.is_none() && modbus.write_allow.is_empty() {
+            return Err(Error::configuration(
+                "plc.queue = true, but nobody may acknowledge: modbus.write_allow is empty",
+            )
+            .allowed("addresses of the PLCs that write, as [\"192.168.1.10\"]")
+            .remedy("name the PLC in modbus.write_allow, or set plc.queue to false"));
+        }
         encoder.check()?;
         import.public_key.as_deref().map_or(Ok(()), |key| public_key(key).map(drop))
     }

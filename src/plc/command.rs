@@ -1,5 +1,8 @@
 //! What a PLC may command, and what may become of it.
 
+use std::fmt;
+use std::net::IpAddr;
+
 /// What a PLC asks of the vision thread.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Request {
@@ -18,6 +21,24 @@ pub const COMMANDS: [(u16, &str); 5] = [
     (5, "round dimensions to multiples of `argument` tenths of a mm, 1 to 500"),
 ];
 
+/// Who gave a command.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Sender {
+    /// A Modbus client.
+    Modbus(IpAddr),
+    /// Somebody on the CAN bus, which knows no addresses.
+    Can,
+}
+
+impl fmt::Display for Sender {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        match self {
+            Self::Modbus(address) => write!(f, "Modbus {address}"),
+            Self::Can => write!(f, "CAN"),
+        }
+    }
+}
+
 /// What became of a command.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Outcome {
@@ -31,15 +52,21 @@ pub enum Outcome {
     Argument,
     /// Vision is busy with earlier ones: try again.
     Busy,
+    /// The ticket is that of the last command, which was another one.
+    TicketUsed,
 }
 
 impl Outcome {
     /// Codes and meanings.
-    pub const ALL: [(Self, &str); 5] = [
+    pub const ALL: [(Self, &str); 6] = [
         (Self::None, "no command yet"),
         (Self::Done, "done"),
         (Self::Unknown, "no such command"),
         (Self::Argument, "argument out of range: nothing was changed"),
-        (Self::Busy, "busy with earlier commands: try again"),
+        (Self::Busy, "busy with earlier commands: try again with the next ticket"),
+        (
+            Self::TicketUsed,
+            "the last command, another one, had this ticket: nothing was done, take the next ticket",
+        ),
     ];
 }

@@ -50,11 +50,17 @@ pub fn markdown() -> String {
     let _ = writeln!(
         text,
         "\n## Commands, from address {COMMAND}; written by the PLC\n\n\
+         Only addresses in `modbus.write_allow` may write (FC 6, 16, 23); others get exception 1. Every command is\n\
+         logged with its sender. A write is answered when the disk has what it changed.\n\n\
          Two-register values are written whole. A request is carried out whole or refused whole: exception 2 for\n\
          an address, exception 3 for a value. In a write of several registers an acknowledgment of a parcel that\n\
-         never was is left out instead: a PLC may hold a number from before a restart. Write command and argument before or together with `ticket`; the\n\
-         outcome is there when `ticket_done` equals it. The same ticket again does nothing, so a write\n\
-         that was not answered may be repeated.\n"
+         never was is left out instead: a PLC may hold a number from before a restart.\n\n\
+         **Tickets.** Write command and argument before or together with `ticket`; the outcome is there when\n\
+         `ticket_done` equals it. The same ticket with the same command again does nothing, so a write that was not\n\
+         answered may be repeated, and a PLC may write its whole block all the time. Take `ticket_done` + 1 for the next\n\
+         command (after 65535 comes 1). The last ticket is kept over a restart of Beltgauge, with `plc.state_file`. A PLC\n\
+         that restarts goes on with the ticket of a command that was under way, or writes ticket 0 once: after that\n\
+         any ticket is new. `plc.st` has it as a function block.\n"
     );
     table(&mut text, COMMAND_FIELDS, COMMAND);
     text.push_str("\n| command | what it does |\n|---|---|\n");

@@ -22,12 +22,15 @@ const READ_HOLDING: u8 = 3;
 const READ_INPUT: u8 = 4;
 const WRITE_ONE: u8 = 6;
 const WRITE_MANY: u8 = 16;
+const READ_AND_WRITE: u8 = 23;
 /// Encapsulated interface, with its type "read device identification".
 const IDENTIFY: [u8; 2] = [43, 14];
 /// Registers, bits and written registers in one request, by the protocol.
 const READ_COUNT_MAX: u16 = 125;
 const BIT_COUNT_MAX: u16 = 2000;
 const WRITE_COUNT_MAX: u16 = 123;
+/// Written registers of a request that also reads.
+const WRITE_BESIDE_READ_MAX: u16 = 121;
 
 const ILLEGAL_FUNCTION: u8 = 1;
 const ILLEGAL_DATA_ADDRESS: u8 = 2;
@@ -61,12 +64,23 @@ fn judge(pdu: &[u8]) -> Verdict {
         {
             within(high, low, WRITE_COUNT_MAX)
         }
+        [READ_AND_WRITE, _, _, read_high, read_low, _, _, high, low, bytes, ref values @ ..]
+            if values.len() == usize::from(bytes)
+                && u16::from(bytes) == 2 * u16::from_be_bytes([0, low]) =>
+        {
+            match within(high, low, WRITE_BESIDE_READ_MAX) {
+                Verdict::Forward => within(read_high, read_low, READ_COUNT_MAX),
+                refused => refused,
+            }
+        }
         [function, kind, code @ 1..=4, object] if [function, kind] == IDENTIFY => {
             Verdict::Identify(code, object)
         }
-        [READ_COILS | READ_DISCRETE | READ_HOLDING | READ_INPUT | WRITE_ONE | WRITE_MANY, ..] => {
-            Verdict::Refuse(ILLEGAL_DATA_VALUE)
-        }
+        [
+            READ_COILS | READ_DISCRETE | READ_HOLDING | READ_INPUT | WRITE_ONE | WRITE_MANY
+            | READ_AND_WRITE,
+            ..,
+        ] => Verdict::Refuse(ILLEGAL_DATA_VALUE),
         [function, kind, ..] if [function, kind] == IDENTIFY => Verdict::Refuse(ILLEGAL_DATA_VALUE),
         _ => Verdict::Refuse(ILLEGAL_FUNCTION),
     }
@@ -177,6 +191,7 @@ mod tests {
             &[2, 0, 0, 0, 32],
             &[6, 0, 60, 0, 1],
             &[16, 0, 60, 0, 2, 4, 0, 1, 0, 2],
+            &[23, 0, 140, 0, 32, 0, 60, 0, 1, 2, 0, 7],
         ] {
             assert_eq!(judge(pdu), Verdict::Forward, "{pdu:?}");
         }
@@ -193,12 +208,17 @@ mod tests {
             &[16, 0, 60, 1, 2, 4, 0, 1, 0, 2],
             &[16, 0, 60, 0, 0, 0],
             &[16],
+            &[23, 0, 140, 0, 0, 0, 60, 0, 1, 2, 0, 7],
+            &[23, 0, 140, 0, 126, 0, 60, 0, 1, 2, 0, 7],
+            &[23, 0, 140, 0, 32, 0, 60, 0, 0, 0],
+            &[23, 0, 140, 0, 32, 0, 60, 0, 2, 2, 0, 7],
+            &[23, 0, 140, 0, 32, 0, 60],
             &[43, 14, 0, 0],
             &[43, 14, 1],
         ] {
             assert_eq!(judge(pdu), Verdict::Refuse(ILLEGAL_DATA_VALUE), "{pdu:?}");
         }
-        for function in (0..=255).filter(|f| ![1, 2, 3, 4, 6, 16].contains(f)) {
+        for function in (0..=255).filter(|f| ![1, 2, 3, 4, 6, 16, 23].contains(f)) {
             assert_eq!(judge(&[function, 0, 0, 0, 1]), Verdict::Refuse(ILLEGAL_FUNCTION));
         }
     }

@@ -2,6 +2,7 @@
 
 pub mod bus;
 pub mod can;
+mod clients;
 pub mod command;
 pub mod dbc;
 pub mod document;
@@ -10,6 +11,7 @@ mod guard;
 pub mod interface;
 pub mod journal;
 pub mod link;
+mod log_limit;
 pub mod modbus;
 mod present;
 pub mod registers;

@@ -1,18 +1,22 @@
 //! Modbus TCP server: `tokio-modbus` behind the guard, reading the register image.
 //!
-//! In: the link. Out: registers to any number of clients up to `modbus.connections_max`, beyond
-//! which the one silent for longest is disconnected; clients that `modbus.allow` does not name are
-//! turned away. Runs on its own thread; nothing here can block the vision thread.
+//! In: the link. Out: registers to clients, `modbus.connections_max` at once; those that `modbus.allow`
+//! does not name are turned away, and only those that `modbus.write_allow` names may write. A write is
+//! answered when the disk has what it changed. Runs on its own thread; nothing here can block the
+//! vision thread.
 
+use super::clients::{Asked, Clients};
+use super::command::Sender;
 use super::guard;
 use super::link::{Link, Refusal};
+use super::log_limit::LogLimit;
 use super::registers::MAP_VERSION;
 use crate::config::Modbus as Settings;
 use crate::error::{Error, Result};
-use std::future::{Ready, ready};
+use std::future::ready;
 use std::net::{IpAddr, SocketAddr, TcpListener};
-use std::sync::atomic::{AtomicU64, Ordering};
-use std::sync::{Arc, Mutex, PoisonError};
+use std::pin::Pin;
+use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 use std::time::{Duration, Instant};
 use tokio::io::DuplexStream;
 use tokio::net::TcpStream;
@@ -76,34 +80,41 @@ pub fn serve(
 /// Accept clients for ever; a failing listener is tried again.
 async fn accept(listener: tokio::net::TcpListener, settings: Settings, link: SharedLink) {
     let server = tokio_modbus::server::tcp::Server::new(listener);
-    let clients = Mutex::new(Clients { max: settings.connections_max, connected: Vec::new() });
-    let started = Instant::now();
+    let clients = Mutex::new(Clients::new(settings.connections_max));
+    let connects = Arc::new(Mutex::new(LogLimit::default()));
+    let refused_writes = Arc::new(Mutex::new(LogLimit::default()));
     let on_connected = |stream: TcpStream, address: SocketAddr| {
         let allowed = is_allowed(&settings.allow, address.ip());
-        if !allowed {
-            tracing::warn!(%address, "Modbus client not in modbus.allow: turned away");
+        let told = lock(&connects).admits(Instant::now());
+        if let Some(before) = told {
+            tracing::info!(%address, allowed, not_logged_before = before, "Modbus client connects");
         }
         let _ = stream.set_nodelay(true);
         let idle = Duration::from_secs(settings.idle_timeout_s);
-        let registers = Registers { link: Arc::clone(&link), base: settings.base_address };
-        let (library_end, guard_end) = tokio::io::duplex(PIPE_BYTES);
-        let last_request = Arc::new(AtomicU64::new(0));
-        let seen = Arc::clone(&last_request);
-        let note_request = move || {
-            seen.store(started.elapsed().as_millis() as u64, Ordering::Relaxed);
+        let registers = Registers {
+            link: Arc::clone(&link),
+            base: settings.base_address,
+            client: address.ip().to_canonical(),
+            may_write: may_write(&settings.write_allow, address.ip()),
+            refused_writes: Arc::clone(&refused_writes),
         };
-        note_request();
+        let (library_end, guard_end) = tokio::io::duplex(PIPE_BYTES);
+        let asked = Arc::new(Asked::default());
+        let note_request = {
+            let asked = Arc::clone(&asked);
+            move || asked.note()
+        };
         let connection = tokio::spawn(async move {
             if !allowed {
                 return;
             }
-            tracing::info!(%address, "Modbus client connected");
-            let reason = guard::serve(stream, guard_end, idle, note_request).await;
-            tracing::info!(%address, ?reason, "Modbus client disconnected");
+            let ended = guard::serve(stream, guard_end, idle, note_request).await;
+            if told.is_some() {
+                tracing::info!(%address, ?ended, "Modbus client disconnected");
+            }
         });
-        let client = Client { last_request, connection: connection.abort_handle() };
         if allowed {
-            clients.lock().unwrap_or_else(PoisonError::into_inner).admit(client);
+            lock(&clients).admit(asked, connection.abort_handle());
         }
         async move { Ok(Some((registers, library_end))) }
     };
@@ -115,32 +126,8 @@ async fn accept(listener: tokio::net::TcpListener, settings: Settings, link: Sha
     }
 }
 
-/// The connected clients.
-struct Clients {
-    max: usize,
-    connected: Vec<Client>,
-}
-
-struct Client {
-    /// When it last asked for something, ms since the server started.
-    last_request: Arc<AtomicU64>,
-    connection: tokio::task::AbortHandle,
-}
-
-impl Clients {
-    /// Take a client in. When there are too many, the one silent for longest has to go: a PLC
-    /// that has been restarted must get in, whatever it left half-open before.
-    fn admit(&mut self, client: Client) {
-        self.connected.retain(|c| !c.connection.is_finished());
-        if self.connected.len() >= self.max {
-            let silence = |c: &Client| c.last_request.load(Ordering::Relaxed);
-            let longest = (0..self.connected.len()).min_by_key(|&i| silence(&self.connected[i]));
-            if let Some(i) = longest {
-                self.connected.swap_remove(i).connection.abort();
-            }
-        }
-        self.connected.push(client);
-    }
+fn lock<T>(mutex: &Mutex<T>) -> MutexGuard<'_, T> {
+    mutex.lock().unwrap_or_else(PoisonError::into_inner)
 }
 
 /// Whether a client may connect. An IPv4 client of an IPv6 socket is the same client.
@@ -148,56 +135,106 @@ fn is_allowed(allow: &[IpAddr], client: IpAddr) -> bool {
     allow.is_empty() || allow.iter().any(|a| a.to_canonical() == client.to_canonical())
 }
 
+/// Whether a client may write. The unspecified address stands for everybody.
+fn may_write(allow: &[IpAddr], client: IpAddr) -> bool {
+    let is = |a: &IpAddr| a.is_unspecified() || a.to_canonical() == client.to_canonical();
+    allow.iter().any(is)
+}
+
 /// The library's view of the registers.
 struct Registers {
     link: SharedLink,
     base: u16,
+    client: IpAddr,
+    may_write: bool,
+    refused_writes: Arc<Mutex<LogLimit>>,
 }
 
 impl Service for Registers {
     type Request = Request<'static>;
     type Response = Response;
     type Exception = ExceptionCode;
-    type Future = Ready<std::result::Result<Response, ExceptionCode>>;
+    type Future =
+        Pin<Box<dyn Future<Output = std::result::Result<Response, ExceptionCode>> + Send>>;
 
     fn call(&self, request: Self::Request) -> Self::Future {
+        if writes(&request) && !self.may_write {
+            if let Some(before) = lock(&self.refused_writes).admits(Instant::now()) {
+                let client = self.client;
+                tracing::warn!(%client, not_logged_before = before,
+                    "write refused: the client is not in modbus.write_allow");
+            }
+            return Box::pin(ready(Err(ExceptionCode::IllegalFunction)));
+        }
+        let link = Arc::clone(&self.link);
         // One lock a request: a block read in one request is never torn.
-        let mut link = self.link.lock().unwrap_or_else(PoisonError::into_inner);
-        ready(answer(&mut link, self.base, request))
+        let answered = answer(&mut lock(&link), self.base, Sender::Modbus(self.client), request);
+        Box::pin(async move {
+            let (response, noted) = answered?;
+            // What was written is on the disk before the client is told so.
+            while !lock(&link).is_kept(noted) {
+                tokio::time::sleep(UPDATE_PERIOD).await;
+            }
+            Ok(response)
+        })
     }
 }
 
+fn writes(request: &Request<'_>) -> bool {
+    matches!(
+        request,
+        Request::WriteSingleRegister(..)
+            | Request::WriteMultipleRegisters(..)
+            | Request::ReadWriteMultipleRegisters(..)
+    )
+}
+
+/// The response, and what [`Link::is_kept`] must say before it is sent.
 fn answer(
     link: &mut Link,
     base: u16,
+    sender: Sender,
     request: Request<'_>,
-) -> std::result::Result<Response, ExceptionCode> {
+) -> std::result::Result<(Response, u64), ExceptionCode> {
     let beyond = ExceptionCode::IllegalDataAddress;
     let at = |address: u16| address.checked_sub(base).ok_or(beyond);
     let refused = |refusal| match refusal {
         Refusal::Address => ExceptionCode::IllegalDataAddress,
         Refusal::Value => ExceptionCode::IllegalDataValue,
     };
+    let read = |link: &Link, address: u16, count: u16| {
+        link.read(at(address)?, count).map(<[u16]>::to_vec).ok_or(beyond)
+    };
+    let write = |link: &mut Link, address: u16, values: &[u16]| {
+        link.write(at(address)?, values, sender, Instant::now()).map_err(refused)
+    };
     Ok(match request {
         Request::ReadHoldingRegisters(address, count) => {
-            Response::ReadHoldingRegisters(link.read(at(address)?, count).ok_or(beyond)?.to_vec())
+            (Response::ReadHoldingRegisters(read(link, address, count)?), 0)
         }
         Request::ReadInputRegisters(address, count) => {
-            Response::ReadInputRegisters(link.read(at(address)?, count).ok_or(beyond)?.to_vec())
+            (Response::ReadInputRegisters(read(link, address, count)?), 0)
         }
         Request::ReadCoils(address, count) => {
-            Response::ReadCoils(link.bits(at(address)?, count).ok_or(beyond)?.collect())
+            (Response::ReadCoils(link.bits(at(address)?, count).ok_or(beyond)?.collect()), 0)
         }
         Request::ReadDiscreteInputs(address, count) => {
-            Response::ReadDiscreteInputs(link.bits(at(address)?, count).ok_or(beyond)?.collect())
+            let bits = link.bits(at(address)?, count).ok_or(beyond)?.collect();
+            (Response::ReadDiscreteInputs(bits), 0)
         }
         Request::WriteSingleRegister(address, value) => {
-            link.write(at(address)?, &[value], Instant::now()).map_err(refused)?;
-            Response::WriteSingleRegister(address, value)
+            let noted = write(link, address, &[value])?;
+            (Response::WriteSingleRegister(address, value), noted)
         }
         Request::WriteMultipleRegisters(address, values) => {
-            link.write(at(address)?, &values, Instant::now()).map_err(refused)?;
-            Response::WriteMultipleRegisters(address, values.len() as u16)
+            let noted = write(link, address, &values)?;
+            (Response::WriteMultipleRegisters(address, values.len() as u16), noted)
+        }
+        Request::ReadWriteMultipleRegisters(address, count, write_address, values) => {
+            // Whole or not at all: what cannot be read is not written either.
+            read(link, address, count)?;
+            let noted = write(link, write_address, &values)?;
+            (Response::ReadWriteMultipleRegisters(read(link, address, count)?), noted)
         }
         _ => return Err(ExceptionCode::IllegalFunction),
     })
@@ -229,19 +266,27 @@ mod tests {
             Journal::default(),
             Instant::now(),
         );
-        let mut read =
-            |address, count| answer(&mut link, 1000, Request::ReadHoldingRegisters(address, count));
+        let mut answer = |request| answer(&mut link, 1000, Sender::Can, request).map(|(r, _)| r);
+        let mut read = |address, count| answer(Request::ReadHoldingRegisters(address, count));
         let words = vec![0x4247, MAP_VERSION, 0x5678, 0x1234];
         assert_eq!(read(1000, 4), Ok(Response::ReadHoldingRegisters(words)));
         for (address, count) in [(999, 1), (0, 4), (1000 + 1224, 1), (65535, 1)] {
             assert_eq!(read(address, count), Err(ExceptionCode::IllegalDataAddress));
         }
         let count = Request::WriteMultipleRegisters(1062, vec![7, 1].into());
-        assert_eq!(answer(&mut link, 1000, count), Ok(Response::WriteMultipleRegisters(1062, 2)));
-        assert_eq!(link.next_count().map(|(count, _)| count), Some(0x1_0007));
-        let elsewhere = Request::WriteSingleRegister(60, 1);
-        let refused = answer(&mut link, 1000, elsewhere);
-        assert_eq!(refused, Err(ExceptionCode::IllegalDataAddress));
+        assert_eq!(answer(count), Ok(Response::WriteMultipleRegisters(1062, 2)));
+        let elsewhere = answer(Request::WriteSingleRegister(60, 1));
+        assert_eq!(elsewhere, Err(ExceptionCode::IllegalDataAddress));
+        let both = |read_at, write_at| {
+            Request::ReadWriteMultipleRegisters(read_at, 2, write_at, vec![9, 1].into())
+        };
+        for (read_at, write_at) in [(999, 1062), (1062, 999)] {
+            assert_eq!(answer(both(read_at, write_at)), Err(ExceptionCode::IllegalDataAddress));
+        }
+        let written = Response::ReadWriteMultipleRegisters(vec![9, 1]);
+        assert_eq!(answer(both(1062, 1062)), Ok(written));
+        let counts = std::iter::from_fn(|| link.next_count()).map(|(count, _)| count);
+        assert!(counts.eq([0x1_0007, 0x1_0009]), "the refused ones have changed nothing");
     }
 
     #[test]
@@ -257,6 +302,9 @@ mod tests {
             ("::ffff:10.0.0.9", false),
         ] {
             assert_eq!(is_allowed(&allow, ip(client)), expected, "{client}");
+            assert_eq!(may_write(&allow, ip(client)), expected, "{client}");
         }
+        assert!(!may_write(&[], ip("10.0.0.1")), "nobody");
+        assert!(may_write(&[ip("0.0.0.0")], ip("10.0.0.1")), "everybody");
     }
 }

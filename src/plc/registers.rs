@@ -4,6 +4,7 @@
 //! sequence number first and last, so that a client that reads it in two requests can tell whether
 //! it changed in between.
 
+use super::journal::Keeping;
 use super::table::{Field, fields};
 use crate::config::WordOrder;
 use crate::event::{Counters, ParcelRecord, Shape};
@@ -143,10 +144,12 @@ pub struct Status {
     pub outcome: u16,
     /// Scale interval.
     pub scale_interval_mm: f64,
+    /// Where numbers, acknowledgments and tickets are kept.
+    pub keeping: Keeping,
 }
 
 /// What is wrong or worth knowing: code and meaning.
-pub const REASONS: [(u16, &str); 14] = [
+pub const REASONS: [(u16, &str); 15] = [
     (0, "all is well"),
     (1, "the frame source has ended or failed"),
     (2, "no frames arrive"),
@@ -161,6 +164,10 @@ pub const REASONS: [(u16, &str); 14] = [
     (11, "a table or queue has been full since start, see the counters"),
     (12, "the camera is not there, or does not do what the configuration asks for: see the log"),
     (13, "the last configuration that was imported was refused: see its report"),
+    (
+        14,
+        "the disk fails: sequence numbers, acknowledgments and tickets would not survive a restart; see the log",
+    ),
 ];
 
 impl Status {
@@ -191,6 +198,7 @@ impl Status {
             matches!(self.can.state, CanState::BusOff | CanState::Down),
             self.encoder_silent,
             self.vision.camera_absent,
+            self.keeping == Keeping::Failing,
         ])
     }
 
@@ -204,6 +212,7 @@ impl Status {
             (3, self.can.state == CanState::BusOff),
             (4, self.can.state == CanState::Down),
             (5, self.can.state == CanState::Passive),
+            (14, self.keeping == Keeping::Failing),
             (6, self.encoder_silent),
             (7, self.plc_silent),
             (8, !self.vision.ready),
@@ -255,7 +264,7 @@ pub const STATUS_FIELDS: &[StatusField] = fields![
     [4, V1_0, "test_i16", I16, "", 1.0, "constant -12345: checks the sign", |_| -12345.0],
     [10, V1_0, "heartbeat", U16, "", 1.0, "rises ten times a second while frames arrive; wraps", |s| f64::from(s.heartbeat)],
     [11, V1_0, "status", U16, "bits", 1.0, "bit 0 running, bit 1 ready (belt learned), bit 2 belt motion measured, bit 3 by the encoder, bit 4 stopped by command, bit 5 PLC silent, bit 6 parcels wait to be acknowledged", |s| f64::from(s.status_bits())],
-    [12, V1_0, "fault", U16, "bits", 1.0, "bit 0 frame source ended, bit 1 a table has been full since start (see counters), bit 2 a parcel was never acknowledged, bit 3 CAN bus off or down, bit 4 encoder silent, bit 5 no camera", |s| f64::from(s.fault_bits())],
+    [12, V1_0, "fault", U16, "bits", 1.0, "bit 0 frame source ended, bit 1 a table has been full since start (see counters), bit 2 a parcel was never acknowledged, bit 3 CAN bus off or down, bit 4 encoder silent, bit 5 no camera, bit 6 the disk fails", |s| f64::from(s.fault_bits())],
     [13, V1_0, "belt_speed", U32, "mm/s", 10.0, "belt speed", |s| s.vision.belt_speed_mm_per_s],
     [15, V1_0, "frames", U32, "", 1.0, "frames processed; wraps", |s| wrapped(s.vision.counters.frames)],
     [17, V1_0, "frames_dropped", U32, "", 1.0, "frames that came too late; wraps", |s| wrapped(s.vision.frames_dropped)],
@@ -293,7 +302,7 @@ pub const COMMAND_FIELDS: &[CommandField] = fields![
     [0, V1_1, "plc_heartbeat", U16, "", 1.0, "any value that keeps changing while the PLC is alive", |c| f64::from(c.heartbeat)],
     [1, V1_1, "acknowledge", U16, "", 1.0, "low word of the sequence number up to which parcels were taken; writing it again does no harm", |c| f64::from(c.acknowledge)],
     [2, V1_1, "encoder_count", U32, "", 1.0, "belt position as the encoder counts it, as often as possible; wraps at encoder.bits", |c| f64::from(c.encoder_count)],
-    [4, V1_1, "ticket", U16, "", 1.0, "the command is carried out when this is written with another value than before; never 0", |c| f64::from(c.ticket)],
+    [4, V1_1, "ticket", U16, "", 1.0, "the command is carried out when this is written with another value than the last one; 0: no command", |c| f64::from(c.ticket)],
     [5, V1_1, "command", U16, "", 1.0, "code, see below", |c| f64::from(c.command)],
     [6, V1_1, "argument", U32, "", 1.0, "of the command", |c| f64::from(c.argument)],
 ];
@@ -465,7 +474,7 @@ mod tests {
         status.can.state = CanState::BusOff;
         assert_eq!(status.reason(), 3);
         let codes = REASONS.iter().map(|(code, _)| *code);
-        assert!(codes.eq(0..14));
+        assert!(codes.eq(0..15));
     }
 
     #[test]

@@ -1,6 +1,8 @@
-//! A ready-made decoder and handshake in Structured Text (IEC 61131-3), from the same tables.
+//! A ready-made decoder, handshake and commands in Structured Text (IEC 61131-3), from the same tables.
 
-use super::registers::{COMMAND, MAP_VERSION, PARCEL_FIELDS, PARCEL_STRIDE, QUEUE_HEAD};
+use super::registers::{
+    COMMAND, MAP_VERSION, PARCEL_FIELDS, PARCEL_STRIDE, QUEUE_HEAD, RING_PARCELS, STATUS_FIELDS,
+};
 use super::table::{Field, Type};
 use std::fmt::Write;
 
@@ -48,49 +50,118 @@ fn name<S>(field: &Field<S>) -> String {
 
 /// The source, to be pasted into a project.
 pub fn document() -> String {
-    let last = PARCEL_STRIDE - 1;
     let mut text = format!(
         "(* Beltgauge, register map {}.{}: printed from the tables in src/plc/registers.rs.\n   \
-         Word order high first, base address 0. *)\n\nTYPE BeltgaugeParcel :\nSTRUCT\n",
+         Word order high first, base address 0. *)\n\n",
         MAP_VERSION >> 8,
         MAP_VERSION & 0xff
+    );
+    types(&mut text);
+    decode(&mut text);
+    queue(&mut text);
+    command(&mut text);
+    text
+}
+
+fn types(text: &mut String) {
+    let last = PARCEL_STRIDE - 1;
+    let _ = write!(
+        text,
+        "(* The registers of one parcel: one named type, so that a variable and a parameter are of the same. *)\n\
+         TYPE BeltgaugeBlock : ARRAY[0..{last}] OF UINT;\nEND_TYPE\n\n\
+         (* Numbers of the parcels that were taken last. *)\n\
+         TYPE BeltgaugeTaken : ARRAY[0..{}] OF UDINT;\nEND_TYPE\n\n\
+         TYPE BeltgaugeParcel :\nSTRUCT\n",
+        RING_PARCELS - 1
     );
     for field in PARCEL_FIELDS {
         let (name, kind) = (name(field), type_of(field));
         let _ = writeln!(text, "    {name} : {kind}; (* {} *)", field.meaning);
     }
+    text.push_str("END_STRUCT;\nEND_TYPE\n\n");
+}
+
+fn decode(text: &mut String) {
     let _ = write!(
         text,
-        "END_STRUCT\nEND_TYPE\n\n\
-         (* Decodes one parcel of {PARCEL_STRIDE} registers: the latest, the queue's or one of the ring's. *)\n\
+        "(* Decodes one parcel of {PARCEL_STRIDE} registers: the latest, the queue's or one of the ring's. *)\n\
          FUNCTION_BLOCK BeltgaugeDecode\n\
-         VAR_INPUT\n    block : ARRAY[0..{last}] OF UINT;\nEND_VAR\n\
-         VAR_OUTPUT\n    parcel : BeltgaugeParcel;\n    whole : BOOL; (* there is a parcel and it is not torn *)\nEND_VAR\n"
+         VAR_INPUT\n    block : BeltgaugeBlock;\nEND_VAR\n\
+         VAR_OUTPUT\n    parcel : BeltgaugeParcel;\n    \
+         whole : BOOL; (* there is a parcel and it is not torn *)\n    \
+         may_be_used : BOOL; (* sort by its dimensions only when this is TRUE *)\nEND_VAR\n"
     );
     for field in PARCEL_FIELDS {
         let _ = writeln!(text, "parcel.{} := {};", name(field), expression(field));
     }
+    text.push_str(
+        "whole := (parcel.sequence > 0) AND (parcel.sequence = parcel.sequence_end);\n\
+         may_be_used := whole AND ((parcel.valid MOD 2) = 1);\nEND_FUNCTION_BLOCK\n\n",
+    );
+}
+
+fn queue(text: &mut String) {
+    let last = RING_PARCELS - 1;
     let _ = write!(
         text,
-        "whole := parcel.sequence > 0 AND parcel.sequence = parcel.sequence_end;\nEND_FUNCTION_BLOCK\n\n\
-         (* The handshake with plc.queue = true. Every cycle of the Modbus client: read {PARCEL_STRIDE} holding\n   \
-         registers from {QUEUE_HEAD} into `block`; write `heartbeat` to {COMMAND}, and while decode.whole, every cycle,\n   \
-         `acknowledge` to {}. After a restart of either side parcels that were taken may come once more:\n   \
-         keep `acknowledge` in retained memory. When `boots` does not rise over a restart of Beltgauge (no\n   \
-         plc.state_file), numbers begin at 1: set `acknowledge` to 0. *)\n\
-         PROGRAM BeltgaugeQueue\n\
-         VAR\n    block : ARRAY[0..{last}] OF UINT; (* filled by the Modbus client *)\n    \
-         heartbeat : UINT;\n    ahead : UINT;\n    decode : BeltgaugeDecode;\n    parcel : BeltgaugeParcel;\n    \
-         new_parcel : BOOL; (* TRUE for one cycle: sort `parcel` *)\nEND_VAR\n\
-         VAR RETAIN\n    acknowledge : UINT;\nEND_VAR\n\
-         heartbeat := heartbeat + 1;\n\
+        "(* The handshake with plc.queue = true; this PLC's address is in modbus.write_allow. Every cycle of the\n   \
+         Modbus client: read {PARCEL_STRIDE} holding registers from {QUEUE_HEAD} into `block`; write `heartbeat` to {COMMAND}; while\n   \
+         acknowledging is TRUE, write `acknowledge` to {}. FC 23 does both in one request. After a restart of\n   \
+         either side parcels that were taken may come once more: they are known by their numbers. *)\n\
+         FUNCTION_BLOCK BeltgaugeQueue\n\
+         VAR_INPUT\n    block : BeltgaugeBlock; (* filled by the Modbus client *)\nEND_VAR\n\
+         VAR_OUTPUT\n    heartbeat : UINT;\n    acknowledge : UINT;\n    acknowledging : BOOL;\n    \
+         parcel : BeltgaugeParcel;\n    \
+         new_parcel : BOOL; (* TRUE for one cycle: `parcel` has left the zone *)\n    \
+         may_be_used : BOOL; (* sort by the dimensions of `parcel`; FALSE: its size is not known, its place is *)\nEND_VAR\n\
+         VAR\n    decode : BeltgaugeDecode;\n    known : BOOL;\n    i : INT;\nEND_VAR\n\
+         VAR RETAIN\n    taken : BeltgaugeTaken;\n    next : INT;\nEND_VAR\n\
+         heartbeat := (heartbeat + 1) MOD 65535;\n\
          decode(block := block);\n\
-         (* Later than the one that was taken last, numbers wrapping around. *)\n\
-         ahead := UDINT_TO_UINT((decode.parcel.sequence MOD 65536 + 65536 - UINT_TO_UDINT(acknowledge)) MOD 65536);\n\
-         new_parcel := decode.whole AND ahead > 0 AND ahead < 32768;\n\
-         IF new_parcel THEN\n    parcel := decode.parcel;\n    \
-         acknowledge := UDINT_TO_UINT(parcel.sequence MOD 65536);\nEND_IF;\nEND_PROGRAM\n",
+         acknowledging := decode.whole;\n\
+         known := FALSE;\n\
+         FOR i := 0 TO {last} DO\n    IF taken[i] = decode.parcel.sequence THEN\n        known := TRUE;\n    END_IF;\nEND_FOR;\n\
+         new_parcel := decode.whole AND (NOT known);\n\
+         may_be_used := new_parcel AND decode.may_be_used;\n\
+         IF new_parcel THEN\n    parcel := decode.parcel;\n    taken[next] := parcel.sequence;\n    \
+         next := (next + 1) MOD {RING_PARCELS};\nEND_IF;\n\
+         IF decode.whole THEN\n    acknowledge := UDINT_TO_UINT(decode.parcel.sequence MOD 65536);\nEND_IF;\n\
+         END_FUNCTION_BLOCK\n\n",
         COMMAND + 1
     );
-    text
+}
+
+fn command(text: &mut String) {
+    let at = |name: &str| {
+        let found = STATUS_FIELDS.iter().find(|field| field.name == name);
+        found.map_or(0, |field| field.offset)
+    };
+    let _ = write!(
+        text,
+        "(* Gives commands, each carried out once, whatever restarts. Every cycle of the Modbus client: read\n   \
+         `ticket_done` and `result` from {} and {}; while `busy`, write `ticket`, `code` and `argument` (high word first)\n   \
+         to {} in one request. A command that was under way at a restart of this PLC goes on with its ticket. *)\n\
+         FUNCTION_BLOCK BeltgaugeCommand\n\
+         VAR_INPUT\n    execute : BOOL; (* a rising edge gives the command *)\n    \
+         command : UINT;\n    command_argument : UDINT;\n    \
+         ticket_done : UINT;\n    result : UINT;\n    \
+         fresh : BOOL; (* `ticket_done` and `result` were read since the last call *)\nEND_VAR\n\
+         VAR_OUTPUT\n    ticket : UINT;\n    code : UINT;\n    argument : UDINT;\n    \
+         busy : BOOL;\n    done : BOOL; (* TRUE for one cycle: `outcome` is that of the command *)\n    outcome : UINT;\nEND_VAR\n\
+         VAR\n    before : BOOL;\nEND_VAR\n\
+         VAR RETAIN\n    under_way : BOOL;\n    kept_ticket : UINT;\n    kept_code : UINT;\n    kept_argument : UDINT;\nEND_VAR\n\
+         done := FALSE;\n\
+         IF under_way AND fresh AND (ticket_done = kept_ticket) THEN\n    \
+         under_way := FALSE;\n    done := TRUE;\n    outcome := result;\nEND_IF;\n\
+         IF execute AND (NOT before) AND fresh AND (NOT under_way) THEN\n    \
+         (* The ticket after the last one, never 0. *)\n    \
+         kept_ticket := UDINT_TO_UINT((UINT_TO_UDINT(ticket_done) MOD 65535) + 1);\n    \
+         kept_code := command;\n    kept_argument := command_argument;\n    under_way := TRUE;\nEND_IF;\n\
+         IF fresh OR (NOT execute) THEN\n    before := execute;\nEND_IF;\n\
+         ticket := kept_ticket;\ncode := kept_code;\nargument := kept_argument;\nbusy := under_way;\n\
+         END_FUNCTION_BLOCK\n",
+        at("ticket_done"),
+        at("result"),
+        COMMAND + 4
+    );
 }

@@ -1,0 +1,333 @@
+//! What a PLC sees and does, by whatever wire: parcels in the order and rounding it asked for, a
+//! queue that it acknowledges, a watched heartbeat, commands with their outcome.
+//!
+//! In: records and status from vision; register writes and CAN commands from the PLC. Out: the
+//! register image; records to be sent over CAN; requests to vision.
+
+mod commands;
+
+pub use commands::{Answer, Refusal};
+
+use crate::config::{Plc as Settings, WordOrder};
+use crate::event::ParcelRecord;
+use crate::plc::command::{Outcome, Request};
+use crate::plc::journal::{Journal, Keeping, Override, State};
+use crate::plc::present::presented;
+use crate::plc::registers::{
+    CanStatus, CommandBlock, RING_PARCELS, RegisterImage, Status, VisionStatus,
+};
+use heapless::Deque;
+use std::time::{Duration, Instant};
+
+/// Parcels that wait for the belt to carry them to where they are published.
+const WAITING_MAX: usize = 64;
+/// Parcels that wait to be acknowledged, or to be sent.
+pub const QUEUE_PARCELS: usize = RING_PARCELS as usize;
+/// Parcels that are sent over CAN again after a restart or a disturbance. With CAN FD, where a parcel
+/// is a frame, so many may have been in the kernel's queue of ten and the controller.
+pub(super) const REPEATED: usize = 12;
+/// Encoder counts between two frames.
+const COUNTS_MAX: usize = 64;
+/// Commands between two visits of the vision thread.
+const REQUESTS_MAX: usize = 8;
+/// Without a frame for this long the heartbeat stops.
+const SILENCE: Duration = Duration::from_secs(1);
+/// The state between vision and PLC.
+pub struct Link {
+    settings: Settings,
+    /// What the configuration says, whatever a command has set.
+    configured_scale_interval_mm: f64,
+    order: WordOrder,
+    image: RegisterImage,
+    status: Status,
+    block: CommandBlock,
+    journal: Journal,
+    waiting: Deque<(ParcelRecord, f64), WAITING_MAX>,
+    /// Numbered, and on their way to the disk: with what the journal must have kept.
+    numbered: Deque<(ParcelRecord, u64), WAITING_MAX>,
+    /// Commands whose outcome is on its way to the disk.
+    decided: Deque<Decided, REQUESTS_MAX>,
+    queue: Deque<ParcelRecord, QUEUE_PARCELS>,
+    /// There is a CAN bus.
+    sends: bool,
+    to_send: Deque<ParcelRecord, QUEUE_PARCELS>,
+    /// Parcels that found `to_send` full.
+    unsent: u64,
+    /// Parcels that found `waiting` full.
+    unpublished: u64,
+    counts: Deque<(u32, Instant), COUNTS_MAX>,
+    requests: Deque<Request, REQUESTS_MAX>,
+    /// Of the last acknowledgment, for [`Link::is_kept`].
+    acknowledgment: u64,
+    plc_alive: Instant,
+    encoder_alive: Option<Instant>,
+    beats: Beats,
+}
+
+/// A command that was decided on, and is carried out and told when the disk has it.
+struct Decided {
+    noted: u64,
+    ticket: u16,
+    outcome: Outcome,
+    request: Option<Request>,
+}
+
+/// Rises ten times a second while frames arrive.
+struct Beats {
+    start: Instant,
+    frames: u64,
+    last_frame: Instant,
+}
+
+impl Link {
+    /// What was known at the last start is taken up again from the journal. `sends`: parcels are
+    /// kept for [`Link::next_to_send`].
+    pub fn new(
+        settings: Settings,
+        order: WordOrder,
+        sends: bool,
+        journal: Journal,
+        now: Instant,
+    ) -> Self {
+        let state = *journal.state();
+        let status = Status {
+            boots: if journal.keeping() == Keeping::Memory { 0 } else { state.boots },
+            sequence: journal.records().back().map_or(0, |last| last.seq),
+            ticket: state.ticket,
+            outcome: state.outcome,
+            stopped: state.stopped,
+            ..Status::default()
+        };
+        let mut link = Self {
+            configured_scale_interval_mm: settings.scale_interval_mm,
+            settings,
+            order,
+            image: RegisterImage::new(order),
+            status,
+            block: CommandBlock::default(),
+            journal,
+            waiting: Deque::new(),
+            numbered: Deque::new(),
+            decided: Deque::new(),
+            queue: Deque::new(),
+            sends,
+            to_send: Deque::new(),
+            unsent: 0,
+            unpublished: 0,
+            counts: Deque::new(),
+            requests: Deque::new(),
+            acknowledgment: 0,
+            plc_alive: now,
+            encoder_alive: None,
+            beats: Beats { start: now, frames: 0, last_frame: now },
+        };
+        link.take_up(&state);
+        link.show();
+        link
+    }
+
+    /// What was before the restart holds again.
+    fn take_up(&mut self, state: &State) {
+        let configured_mm = self.settings.scale_interval_mm;
+        self.settings.scale_interval_mm = Override::of(state.scale_interval_mm, configured_mm);
+        self.status.scale_interval_mm = self.settings.scale_interval_mm;
+        if state.stopped {
+            let _ = self.requests.push_back(Request::Report(false)); // invariant: there is room
+        }
+        // The last that were sent may have got no further than the kernel.
+        let repeated_from = state.sent.wrapping_sub(REPEATED as u32);
+        // The journal keeps no more than either has room for.
+        for record in self.journal.records().clone() {
+            self.image.publish(&record);
+            if self.sends && is_after(record.seq, repeated_from) {
+                let _ = self.to_send.push_back(record); // invariant: there is room
+            }
+            if self.settings.queue && is_after(record.seq, state.acknowledged) {
+                let _ = self.queue.push_back(record); // invariant: there is room
+            }
+        }
+    }
+
+    /// A parcel has left the zone, the belt being at `travel_mm`.
+    pub fn record(&mut self, record: ParcelRecord, travel_mm: f64) {
+        // At once, or when the belt is known to be there.
+        let due_mm = match self.settings.publish_after_mm {
+            0.0 => f64::NEG_INFINITY,
+            after_mm => travel_mm + after_mm,
+        };
+        if self.waiting.is_full() {
+            // Better early than never.
+            self.number_first();
+        }
+        self.unpublished += u64::from(self.waiting.push_back((record, due_mm)).is_err());
+    }
+
+    /// Renew the status, publish what is due.
+    pub fn update(
+        &mut self,
+        vision: &VisionStatus,
+        can: &CanStatus,
+        encoder_timeout: Option<Duration>,
+        now: Instant,
+    ) {
+        while self.waiting.front().is_some_and(|(_, due_mm)| vision.belt_travel_mm >= *due_mm)
+            && self.number_first()
+        {}
+        self.publish_kept();
+        let status = &mut self.status;
+        (status.vision, status.can) = (*vision, *can);
+        status.can.parcels_dropped += self.unsent;
+        status.vision.counters.event_overflows += self.unpublished;
+        status.keeping = self.journal.keeping();
+        let beats = &mut self.beats;
+        if vision.counters.frames != beats.frames {
+            (beats.frames, beats.last_frame) = (vision.counters.frames, now);
+        }
+        status.running =
+            beats.frames > 0 && now - beats.last_frame < SILENCE && !vision.source_ended;
+        if status.running {
+            status.heartbeat = ((now - beats.start).as_millis() / 100) as u16;
+        }
+        let timeout_s = self.settings.heartbeat_timeout_s;
+        status.plc_silent = timeout_s > 0.0 && (now - self.plc_alive).as_secs_f64() > timeout_s;
+        status.encoder_silent = encoder_timeout
+            .is_some_and(|timeout| self.encoder_alive.is_none_or(|at| now - at > timeout));
+        self.show();
+    }
+
+    /// All that is left, whatever the belt does: the input has ended.
+    pub fn flush(&mut self) {
+        while !self.waiting.is_empty() && self.number_first() {}
+        self.publish_kept();
+        self.show();
+    }
+
+    /// Whether nothing waits to be published or sent.
+    pub fn is_idle(&self) -> bool {
+        self.waiting.is_empty()
+            && self.numbered.is_empty()
+            && self.decided.is_empty()
+            && self.to_send.is_empty()
+    }
+
+    /// The next parcel gets its sequence number, which the journal keeps before anybody sees it: it is
+    /// never given to another. False when that has to wait: the disk has not answered for many
+    /// parcels, and will soon count as failing.
+    fn number_first(&mut self) -> bool {
+        self.publish_kept();
+        if self.numbered.is_full() {
+            return false;
+        }
+        let Some((record, _)) = self.waiting.pop_front() else { return false };
+        let numbered = self.journal.number(presented(record, &self.settings));
+        if !self.settings.queue {
+            // A queue that is turned on later begins with what comes then.
+            self.journal.taken(numbered.0.seq);
+        }
+        let _ = self.numbered.push_back(numbered); // invariant: there is room
+        self.journal.save();
+        true
+    }
+
+    /// Publish what the disk has. When it fails the belt goes on: what was numbered and not seen by
+    /// anybody is numbered again, beyond what the disk may have.
+    fn publish_kept(&mut self) {
+        if self.journal.began_to_fail() && !self.numbered.is_empty() {
+            self.journal.take_back(self.numbered.len());
+            for (record, noted) in self.numbered.iter_mut() {
+                (*record, *noted) = self.journal.number(*record);
+            }
+        }
+        while self.numbered.front().is_some_and(|(_, noted)| self.journal.is_kept(*noted)) {
+            if let Some((record, _)) = self.numbered.pop_front() {
+                self.publish(record);
+            }
+        }
+        while self.decided.front().is_some_and(|decided| self.journal.is_kept(decided.noted)) {
+            if let Some(decided) = self.decided.pop_front() {
+                self.carry_out(&decided);
+            }
+        }
+    }
+
+    fn carry_out(&mut self, decided: &Decided) {
+        if let Some(request) = decided.request {
+            let _ = self.requests.push_back(request); // invariant: room was asked for
+        }
+        let state = self.journal.state();
+        (self.status.ticket, self.status.outcome) = (decided.ticket, decided.outcome as u16);
+        self.status.stopped = state.stopped;
+        let configured_mm = self.configured_scale_interval_mm;
+        self.settings.scale_interval_mm = Override::of(state.scale_interval_mm, configured_mm);
+        self.status.scale_interval_mm = self.settings.scale_interval_mm;
+    }
+
+    fn publish(&mut self, record: ParcelRecord) {
+        self.status.sequence = record.seq;
+        self.image.publish(&record);
+        if self.settings.queue {
+            if self.queue.is_full() {
+                self.queue.pop_front();
+                self.status.queue_overflows += 1;
+            }
+            let _ = self.queue.push_back(record); // invariant: there is room
+        }
+        if self.sends {
+            if self.to_send.is_full() {
+                self.to_send.pop_front();
+                self.unsent += 1;
+            }
+            let _ = self.to_send.push_back(record); // invariant: there is room
+        }
+    }
+
+    fn show(&mut self) {
+        self.status.queued = self.queue.len() as u16;
+        self.image.set_queue_head(self.queue.front());
+        self.image.set_command(&self.block);
+        self.image.set_status(&self.status);
+        self.journal.save();
+    }
+
+    /// `count` registers from `address`; `None` when any of them does not exist.
+    pub fn read(&self, address: u16, count: u16) -> Option<&[u16]> {
+        self.image.read(address, count)
+    }
+
+    /// Bits as discrete inputs and coils: 16 of status, 16 of faults.
+    pub fn bits(&self, address: u16, count: u16) -> Option<impl Iterator<Item = bool>> {
+        let all = u32::from(self.status.status_bits()) | u32::from(self.status.fault_bits()) << 16;
+        let end = u32::from(address) + u32::from(count);
+        (end <= 32).then(|| (u32::from(address)..end).map(move |bit| all >> bit & 1 == 1))
+    }
+
+    /// What the status block shows.
+    pub fn status(&self) -> &Status {
+        &self.status
+    }
+
+    /// The next parcel to send over CAN.
+    pub fn next_to_send(&mut self) -> Option<ParcelRecord> {
+        let record = self.to_send.pop_front()?;
+        self.journal.sent(record.seq);
+        Some(record)
+    }
+
+    /// The next count of the encoder, and when it came.
+    pub fn next_count(&mut self) -> Option<(u32, Instant)> {
+        self.counts.pop_front()
+    }
+
+    /// The next request to vision.
+    pub fn next_request(&mut self) -> Option<Request> {
+        self.requests.pop_front()
+    }
+}
+
+/// Whether sequence number `a` was given after `b`, numbers wrapping around.
+fn is_after(a: u32, b: u32) -> bool {
+    a != b && a.wrapping_sub(b) < u32::MAX / 2
+}
+
+#[cfg(test)]
+mod tests;
