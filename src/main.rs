@@ -9,7 +9,7 @@ use beltgauge::event::ParcelRecord;
 use beltgauge::run::budget::{self, StraightDown};
 use beltgauge::run::calibrate::{self, DataSheet};
 use beltgauge::run::offline::{self, Observer, Outputs};
-use beltgauge::run::{demo, import, live, privileges, update};
+use beltgauge::run::{demo, import, live, log, privileges, update};
 use beltgauge::{run, source};
 use clap::{Parser, Subcommand};
 use std::io::{IsTerminal, Write};
@@ -18,27 +18,19 @@ use std::ops::RangeInclusive;
 use std::path::PathBuf;
 use std::process::ExitCode;
 use tracing::Level;
-use tracing_subscriber::EnvFilter;
 
 /// Measures parcels on a conveyor with one fixed camera.
 #[derive(Parser)]
 #[command(version)]
 struct Cli {
     /// How the log on standard error looks; `RUST_LOG` says how much is in it.
-    #[arg(long, global = true, value_enum, default_value_t = LogFormat::Text)]
-    log: LogFormat,
+    #[arg(long, global = true, value_enum, default_value_t = log::Format::Text)]
+    log: log::Format,
     /// Become this user, given by number, and keep only the capabilities that are needed.
     #[arg(long, global = true)]
     user: Option<u32>,
     #[command(subcommand)]
     command: Command,
-}
-
-/// Formats of the log.
-#[derive(Clone, Copy, clap::ValueEnum)]
-enum LogFormat {
-    Text,
-    Json,
 }
 
 #[derive(Subcommand)]
@@ -265,27 +257,25 @@ fn thickness(text: &str) -> std::result::Result<f64, String> {
 
 fn main() -> ExitCode {
     let cli = Cli::parse();
-    start_log(&cli);
-    let user = cli.user.map_or(Ok(()), privileges::become_user);
-    match user.and_then(|()| dispatch(cli.command)) {
-        Ok(()) => ExitCode::SUCCESS,
-        Err(error) => {
-            let _ = writeln!(std::io::stderr(), "error: {error}");
-            ExitCode::from(error.exit_status())
-        }
-    }
-}
-
-/// Logs go beside the results, on standard error: `RUST_LOG=beltgauge=debug` shows more.
-fn start_log(cli: &Cli) {
+    let is_appliance = matches!(cli.command, Command::Run { .. } | Command::Demo { .. });
     // An appliance's log is all that it leaves; a tool's results speak for themselves.
     let level = if matches!(cli.command, Command::Run { .. }) { Level::INFO } else { Level::WARN };
-    let filter = EnvFilter::builder().with_default_directive(level.into()).from_env_lossy();
-    let log = tracing_subscriber::fmt().with_env_filter(filter).with_writer(std::io::stderr);
-    match cli.log {
-        LogFormat::Text => log.init(),
-        LogFormat::Json => log.json().init(),
+    let log = log::start(level, cli.log);
+    if is_appliance {
+        run::end_on_panic();
     }
+    let user = cli.user.map_or(Ok(()), privileges::become_user);
+    let ended = user.and_then(|()| dispatch(cli.command));
+    let status = match ended {
+        Ok(()) => ExitCode::SUCCESS,
+        Err(error) => {
+            log::say(format_args!("error: {error}\n"));
+            ExitCode::from(error.exit_status())
+        }
+    };
+    // Writes what is left; when nobody reads it ends all the same.
+    drop(log);
+    status
 }
 
 /// A line on standard output.

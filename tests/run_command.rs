@@ -108,3 +108,48 @@ fn without_a_configuration_it_ends_with_the_remedy() {
     assert_eq!(output.status.code(), Some(2), "{text}");
     assert!(text.contains("current/beltgauge.toml") && text.contains("remedy"), "{text}");
 }
+
+/// A pipe that nobody reads, and that is full.
+fn full_pipe() -> (std::io::PipeReader, std::io::PipeWriter) {
+    use std::io::Write;
+    let (reader, mut writer) = std::io::pipe().expect("a pipe");
+    let flags = rustix::fs::fcntl_getfl(&writer).expect("ours");
+    rustix::fs::fcntl_setfl(&writer, flags | rustix::fs::OFlags::NONBLOCK).expect("ours");
+    while writer.write(&[b'x'; 4096]).is_ok() {}
+    while writer.write(b"x").is_ok() {}
+    rustix::fs::fcntl_setfl(&writer, flags).expect("ours");
+    (reader, writer)
+}
+
+#[test]
+fn a_log_that_nobody_reads_holds_nobody_up() {
+    let folder = scratch("run-unread");
+    let config = write_site(&folder, SIZE);
+    let free = std::net::TcpListener::bind("127.0.0.1:0").and_then(|l| l.local_addr());
+    let address = free.expect("a free port");
+    let text = fs::read_to_string(&config).expect("there");
+    let text = text.replace("[zone]", "device = \"/dev/video99\"\n[zone]");
+    fs::write(&config, format!("{text}[modbus]\nlisten = \"{address}\"\n")).expect("room");
+    let (_reader, writer) = full_pipe();
+    let child = beltgauge()
+        .args(["run", "--config"])
+        .arg(&config)
+        .arg("--status")
+        .arg(folder.join("status.json"))
+        .env("RUST_LOG", "trace")
+        .stdout(Stdio::null())
+        .stderr(writer)
+        .spawn();
+    let mut run = Run(child.expect("starts"));
+    wait_for(&folder.join("status.json"), &["\"camera_absent\":true"]);
+    // Every connection logs a line or two.
+    for _ in 0..50 {
+        let mut plc = std::net::TcpStream::connect(address).expect("the server listens");
+        plc.set_read_timeout(Some(Duration::from_secs(5))).expect("a time");
+        std::io::Write::write_all(&mut plc, &[0, 1, 0, 0, 0, 6, 1, 3, 0, 0, 0, 1]).expect("sent");
+        let mut answer = [0; 11];
+        std::io::Read::read_exact(&mut plc, &mut answer).expect("an answer");
+        assert_eq!(answer[9..], [0x42, 0x47]);
+    }
+    assert_eq!(terminate(&mut run), Some(0));
+}

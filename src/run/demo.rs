@@ -1,14 +1,13 @@
 //! `beltgauge demo`: the appliance in real time on the synthetic belt, and the truth beside it.
 
 use super::annotate::draw;
-use super::{Appliance, Progress};
+use super::{Appliance, Progress, log};
 use crate::config::{Config, Site};
 use crate::error::{Error, Result};
 use crate::event::ParcelRecord;
 use crate::source::synthetic::{Parcel, Scenario, Synthetic};
 use crate::source::{FrameSource, Pace, Paced};
 use std::fmt::Write as _;
-use std::io::Write as _;
 use std::net::SocketAddr;
 use std::path::Path;
 use std::time::{Duration, Instant};
@@ -86,10 +85,9 @@ pub fn run(options: Options<'_>) -> Result<String> {
     std::fs::create_dir_all(options.out).map_err(failed)?;
     let records_path = options.out.join("parcels.jsonl");
     std::fs::write(&records_path, "").map_err(failed)?; // found out now, not at the end
-    let _ = writeln!(
-        std::io::stderr(),
-        "rendering the belt; Modbus TCP on {listen}, registers as in config/REGISTERS.md"
-    );
+    log::say(format_args!(
+        "rendering the belt; Modbus TCP on {listen}, registers as in config/REGISTERS.md\n"
+    ));
     let mut source = Synthetic::new(scenario)?;
     let appliance = Appliance::new(site)?;
     let mut records: Vec<ParcelRecord> = Vec::new();
@@ -103,7 +101,7 @@ pub fn run(options: Options<'_>) -> Result<String> {
             }
             start.elapsed().as_secs_f64() < options.seconds
         })?;
-    let _ = writeln!(std::io::stderr());
+    log::say(format_args!("\n"));
     let mut lines = Vec::new();
     for record in &records {
         serde_json::to_writer(&mut lines, record).map_err(|e| failed(e.into()))?;
@@ -139,9 +137,7 @@ fn console(progress: &Progress, elapsed: Duration, last: Option<&ParcelRecord>) 
         if status.belt_measured { "" } else { " (assumed)" },
         status.counters.parcels,
     );
-    // Nobody need be listening.
-    let mut console = std::io::stderr();
-    let _ = write!(console, "\r{line:100}").and_then(|()| console.flush());
+    log::say(format_args!("\r{line:100}"));
 }
 
 /// The parcel of the scenario that a record is of.

@@ -1,6 +1,6 @@
 //! `beltgauge run`: the appliance on a live camera, until it is told to stop.
 
-use super::{Appliance, ImportBoard, Progress, Watchdog};
+use super::{Appliance, ImportBoard, Progress, Watchdog, log};
 use crate::config::store::{ImportRecord, Store};
 use crate::config::{Can, Site};
 use crate::error::{Error, Result};
@@ -11,9 +11,9 @@ use crate::source::{Live, open_camera};
 use serde::Serialize;
 use signal_hook::consts::{SIGINT, SIGTERM};
 use std::path::{Path, PathBuf};
-use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
-use std::time::{Duration, Instant};
+use std::sync::{Arc, Mutex, PoisonError};
+use std::time::Duration;
 
 /// Status file and imports are looked after this often.
 const HOUSEKEEPING: Duration = Duration::from_secs(1);
@@ -43,34 +43,75 @@ pub fn run(options: &Options<'_>) -> Result<()> {
     if options.config.is_none() {
         site.config.plc.state_file.get_or_insert_with(|| store.plc_state());
     }
-    let mut can = CanSetUp { settings: site.config.can.clone(), done: None, complaint: None };
+    let can = CanSetUp { settings: site.config.can.clone(), done: None, complaint: None };
     let camera = site.config.camera.clone();
     let mut feed = Live::new(camera, site.camera.image_size_px, open_camera);
     let listen = site.config.modbus.listen;
     let watchdog = Watchdog::new(options.watchdog)?;
     let (appliance, imports) = Appliance::new(site)?.supervised(watchdog);
     tracing::info!("measuring; Modbus TCP on {listen}");
-    tell(&imports, store.last_import());
+    let seen_last = Arc::<Mutex<Progress>>::default();
+    let housekeeping = Housekeeping {
+        can,
+        imports,
+        store,
+        status: options.status.map(Path::to_owned),
+        progress: Arc::clone(&seen_last),
+        log_lines_dropped: 0,
+    };
+    housekeeping.start()?;
     let mut seen = false;
-    let mut kept_at: Option<Instant> = None;
     let progress = appliance.run(&mut feed, |progress, records| {
-        records.for_each(|record| log(&record));
+        records.for_each(|record| log_parcel(&record));
         if !seen && progress.status.counters.frames > 0 {
             seen = true;
             tracing::info!("the first frame was processed");
         }
-        if kept_at.is_none_or(|at| at.elapsed() >= HOUSEKEEPING) {
-            kept_at = Some(Instant::now());
-            can.try_now();
-            tell(&imports, store.last_import());
-            if let Some(path) = options.status {
-                write_status(path, progress);
-            }
-        }
+        *seen_last.lock().unwrap_or_else(PoisonError::into_inner) = *progress;
         !stop.load(Ordering::Relaxed)
     })?;
     tracing::info!("stopped; {}", progress.status.counters);
     Ok(())
+}
+
+/// What touches disks and interfaces now and then: on a thread of its own, which nobody waits for.
+struct Housekeeping {
+    can: CanSetUp,
+    imports: ImportBoard,
+    store: Store,
+    status: Option<PathBuf>,
+    progress: Arc<Mutex<Progress>>,
+    log_lines_dropped: u64,
+}
+
+impl Housekeeping {
+    fn start(mut self) -> Result<()> {
+        tell(&self.imports, self.store.last_import());
+        std::thread::Builder::new()
+            .name("housekeeping".into())
+            .spawn(move || {
+                loop {
+                    self.look();
+                    std::thread::sleep(HOUSEKEEPING);
+                }
+            })
+            .map(drop)
+            .map_err(|e| Error::failure(format!("cannot start the housekeeping thread: {e}")))
+    }
+
+    fn look(&mut self) {
+        self.can.try_now();
+        tell(&self.imports, self.store.last_import());
+        let dropped = log::lines_dropped();
+        if dropped > self.log_lines_dropped {
+            tracing::warn!("{dropped} log lines were dropped since start: nobody reads them");
+            self.log_lines_dropped = dropped;
+        }
+        if let Some(path) = &self.status {
+            let progress = *self.progress.lock().unwrap_or_else(PoisonError::into_inner);
+            write_status(path, &progress);
+        }
+    }
 }
 
 /// The CAN interface, which may be plugged in later than the power, and again.
@@ -103,10 +144,10 @@ impl CanSetUp {
 
 fn tell(board: &ImportBoard, ImportRecord { count, result }: ImportRecord) {
     let status = ImportStatus { count, result: result as u16 };
-    *board.lock().unwrap_or_else(std::sync::PoisonError::into_inner) = status;
+    *board.lock().unwrap_or_else(PoisonError::into_inner) = status;
 }
 
-fn log(record: &ParcelRecord) {
+fn log_parcel(record: &ParcelRecord) {
     tracing::info!(
         seq = record.seq,
         length_mm = record.length_mm,
@@ -133,6 +174,7 @@ struct StatusFile {
     belt_measured: bool,
     time_s: f64,
     frame_time_max_ms: f64,
+    log_lines_dropped: u64,
     imports: u16,
     import_result: u16,
 }
@@ -155,6 +197,7 @@ fn write_status(path: &Path, progress: &Progress) {
         belt_measured: status.belt_measured,
         time_s: status.time_s,
         frame_time_max_ms: progress.frame_time_max.as_secs_f64() * 1e3,
+        log_lines_dropped: log::lines_dropped(),
         imports: status.import.count,
         import_result: status.import.result,
     };

@@ -16,6 +16,29 @@ const CAPTURE_PATIENCE: Duration = Duration::from_secs(40);
 const FEEDING: Duration = Duration::from_secs(1);
 /// The process's exit status when a thread hangs.
 const EXIT_HANGS: i32 = 3;
+/// The process's exit status when a thread panics.
+const EXIT_PANICS: i32 = 4;
+/// The log's last lines are out within this, or nobody reads them.
+const FAREWELL: Duration = Duration::from_millis(300);
+
+/// A panic in any thread from now on ends the process with a status of its own: an invariant is broken,
+/// and the other threads would go on as if all were well.
+pub fn end_on_panic() {
+    std::panic::set_hook(Box::new(|panic| {
+        // Whatever the log does.
+        let ending = std::thread::Builder::new().name("end".into()).spawn(move || {
+            std::thread::sleep(FAREWELL);
+            std::process::exit(EXIT_PANICS);
+        });
+        let thread = std::thread::current();
+        let name = thread.name().unwrap_or("nameless");
+        tracing::error!("the {name} thread: {panic}: giving up, to be started again");
+        match ending {
+            Ok(ending) => drop(ending.join()),
+            Err(_) => std::process::exit(EXIT_PANICS),
+        }
+    }));
+}
 
 /// Rises while a thread lives.
 #[derive(Debug, Default)]
@@ -62,13 +85,13 @@ impl Watchdog {
         Ok(Self { watches: true, hardware: hardware.map(open).transpose()?, ..Self::default() })
     }
 
-    /// Look at the threads; does not return when one hangs.
-    pub fn look(&mut self, beats: &Beats) {
+    /// Look at the threads that are alive, in the order of [`Beats`]; does not return when one hangs.
+    pub fn look(&mut self, beats: &Beats, alive: [bool; 3]) {
         if !self.watches {
             return;
         }
         let now = Instant::now();
-        if let Some(name) = self.hanging(beats, now) {
+        if let Some(name) = self.hanging(beats, alive, now) {
             tracing::error!("the {name} thread hangs: giving up, to be started again");
             // Joining it would hang too.
             std::process::exit(EXIT_HANGS);
@@ -83,14 +106,20 @@ impl Watchdog {
     }
 
     /// The name of a thread that has not beaten for too long.
-    fn hanging(&mut self, beats: &Beats, now: Instant) -> Option<&'static str> {
+    fn hanging(&mut self, beats: &Beats, alive: [bool; 3], now: Instant) -> Option<&'static str> {
         let threads = [
             ("capture", &beats.capture, CAPTURE_PATIENCE),
             ("vision", &beats.vision, PATIENCE),
             ("PLC", &beats.plc, PATIENCE),
         ];
         let mut hanging = None;
-        for ((name, beat, patience), seen) in threads.into_iter().zip(&mut self.seen) {
+        for (((name, beat, patience), seen), alive) in
+            threads.into_iter().zip(&mut self.seen).zip(alive)
+        {
+            // One that has ended does not hang.
+            if !alive {
+                continue;
+            }
             let count = beat.0.load(Ordering::Relaxed);
             match seen {
                 Some((last, at)) if *last == count => {
@@ -127,9 +156,12 @@ mod tests {
             if s < 12 {
                 beats.vision.beat();
             }
-            let hanging = watchdog.hanging(&beats, start + Duration::from_secs(s));
+            let hanging = watchdog.hanging(&beats, [true; 3], start + Duration::from_secs(s));
             // Its last beat was seen at 11 s.
             assert_eq!(hanging, (s > 21).then_some("vision"), "at {s} s");
+            let ended =
+                watchdog.hanging(&beats, [true, false, true], start + Duration::from_secs(s));
+            assert_eq!(ended, None, "it has ended");
         }
     }
 
@@ -139,7 +171,7 @@ mod tests {
         std::fs::write(&path, "").expect("writable");
         let mut watchdog = Watchdog::new(Some(&path)).expect("there");
         let beats = Beats::default();
-        (0..5).for_each(|_| watchdog.look(&beats));
+        (0..5).for_each(|_| watchdog.look(&beats, [true; 3]));
         watchdog.disarm();
         assert_eq!(std::fs::read(&path).expect("readable"), b"\0V");
         let _ = std::fs::remove_file(&path);

@@ -191,9 +191,14 @@ impl Journal {
         }
     }
 
+    /// Whether what was noted is on the disk; in memory only, it is as good as that.
+    pub fn is_on_disk(&self, noted: u64) -> bool {
+        self.writer.as_ref().is_none_or(|writer| noted <= writer.saved())
+    }
+
     /// Whether what was noted is as safe as it gets: on the disk, or the disk fails.
     pub fn is_kept(&self, noted: u64) -> bool {
-        self.writer.as_ref().is_none_or(|writer| noted <= writer.saved() || writer.is_failing())
+        self.is_on_disk(noted) || self.keeping() == Keeping::Failing
     }
 }
 

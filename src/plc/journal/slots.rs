@@ -156,7 +156,7 @@ fn close(kind: u8, number: u32, value: &impl Serialize) -> std::io::Result<[u8; 
 
 /// Give a new file its size, in blocks that the disk has set aside.
 pub fn allocate(file: &File) -> std::io::Result<()> {
-    file.write_all_at(&[0; FILE_BYTES], 0)?;
+    file.write_all_at(&vec![0; FILE_BYTES], 0)?;
     file.sync_all()
 }
 

@@ -177,11 +177,15 @@ impl Link {
     /// How many of the queue an acknowledgment takes; `None` when it is of a parcel that was
     /// never published.
     fn acknowledged_by(&self, low_word: u16) -> Option<usize> {
+        // After the disk failed the queue holds numbers of two blocks, which share no low word.
+        let waiting = self.queue.iter().position(|record| record.seq as u16 == low_word);
         let behind = (self.status.sequence as u16).wrapping_sub(low_word);
-        if behind > u16::MAX / 2 {
-            return None;
+        let is_repetition = self.journal.state().acknowledged as u16 == low_word;
+        match waiting {
+            Some(at) => Some(at + 1),
+            None if is_repetition || behind <= u16::MAX / 2 => Some(0),
+            None => None,
         }
-        Some(self.queue.len().saturating_sub(usize::from(behind)))
     }
 
     /// Returns a number for [`Link::is_kept`].

@@ -232,21 +232,28 @@ impl Link {
     /// Publish what the disk has. When it fails the belt goes on: what was numbered and not seen by
     /// anybody is numbered again, beyond what the disk may have.
     fn publish_kept(&mut self) {
+        while self.numbered.front().is_some_and(|(_, noted)| self.journal.is_on_disk(*noted)) {
+            self.publish_first();
+        }
         if self.journal.began_to_fail() && !self.numbered.is_empty() {
             self.journal.take_back(self.numbered.len());
-            for (record, noted) in self.numbered.iter_mut() {
+            for (record, noted) in &mut self.numbered {
                 (*record, *noted) = self.journal.number(*record);
             }
         }
         while self.numbered.front().is_some_and(|(_, noted)| self.journal.is_kept(*noted)) {
-            if let Some((record, _)) = self.numbered.pop_front() {
-                self.publish(record);
-            }
+            self.publish_first();
         }
         while self.decided.front().is_some_and(|decided| self.journal.is_kept(decided.noted)) {
             if let Some(decided) = self.decided.pop_front() {
                 self.carry_out(&decided);
             }
+        }
+    }
+
+    fn publish_first(&mut self) {
+        if let Some((record, _)) = self.numbered.pop_front() {
+            self.publish(record);
         }
     }
 

@@ -232,7 +232,7 @@ impl Appliance {
             })?;
             while !(capture.is_finished() || vision.is_finished() || plc.is_finished()) {
                 std::thread::park_timeout(PARK);
-                watchdog.look(&shared.beats);
+                watchdog.look(&shared.beats, [true; 3]);
                 let mut records = std::iter::from_fn(|| observer_out.dequeue());
                 if !observe(&shared.progress(), &mut records) {
                     break;
@@ -277,14 +277,12 @@ fn spawn<'scope, 'env>(
 
 /// Watch the threads until all have ended.
 fn watch_the_end(threads: [&Handle<'_>; 3], watchdog: &mut Watchdog, beats: &Beats) {
-    while !threads.iter().all(|thread| thread.is_finished()) {
-        for (thread, beat) in threads.iter().zip([&beats.capture, &beats.vision, &beats.plc]) {
-            // One that has ended does not hang.
-            if thread.is_finished() {
-                beat.beat();
-            }
+    loop {
+        let alive = threads.map(|thread| !thread.is_finished());
+        if alive == [false; 3] {
+            return;
         }
-        watchdog.look(beats);
+        watchdog.look(beats, alive);
         std::thread::sleep(ENDING);
     }
 }
