@@ -3,13 +3,13 @@
 use beltgauge::camera::LensModel;
 use beltgauge::camera::chessboard::Chessboard;
 use beltgauge::config::Site;
-use beltgauge::config::store::Store;
 use beltgauge::error::{Error, Result};
 use beltgauge::event::ParcelRecord;
 use beltgauge::run::budget::{self, StraightDown};
 use beltgauge::run::calibrate::{self, DataSheet};
 use beltgauge::run::offline::{self, Observer, Outputs};
 use beltgauge::run::{demo, import, live, privileges, update};
+use beltgauge::store::{Store, manifest};
 use beltgauge::{run, source};
 use clap::{Parser, Subcommand};
 use std::io::{IsTerminal, Write};
@@ -115,6 +115,14 @@ enum Command {
         /// Folder to put configurations into.
         #[arg(long, default_value = STORE)]
         store: PathBuf,
+    },
+    /// List the files of a stick with their digests, to be signed as one set.
+    Manifest {
+        /// The stick: a folder with a folder `beltgauge` in it.
+        dir: PathBuf,
+        /// Higher than that of every set before, for example the date and a number: 2026112601.
+        #[arg(long)]
+        counter: u64,
     },
     /// Put the new system on a stick into the boot partition, to be tried at the next start.
     Update {
@@ -344,12 +352,18 @@ fn dispatch(command: Command) -> Result<()> {
             };
             print(format_args!("{}", report.trim_end()))
         }
+        Command::Manifest { dir, counter } => {
+            print(format_args!("{}", manifest::make(&dir, counter)?))
+        }
         Command::Update { dir, store, to } => {
             let report = update::update(&dir, &Store::new(&store), &to)?;
             print(format_args!("{}", report.trim_end()))
         }
         Command::Check { config, store } => {
-            let site = Site::load(&config.unwrap_or_else(|| Store::new(&store).config()))?;
+            let site = match config {
+                Some(config) => Site::load(&config),
+                None => Store::new(&store).site(),
+            }?;
             let plan = run::plan(&site);
             print(format_args!("{plan}"))?;
             plan.check_limit(site.config.limits.memory_mib_max)?;
