@@ -8,6 +8,7 @@ use beltgauge::event::ParcelRecord;
 use beltgauge::run::budget::{self, StraightDown};
 use beltgauge::run::calibrate::{self, DataSheet};
 use beltgauge::run::offline::{self, Observer, Outputs};
+use beltgauge::run::outputs::refuse_inputs;
 use beltgauge::run::{demo, import, live, privileges, update};
 use beltgauge::store::{Store, manifest};
 use beltgauge::{run, source};
@@ -331,6 +332,8 @@ fn dispatch(command: Command) -> Result<()> {
         Command::Measure { input, config, fps, jsonl, annotate } => {
             let site = Site::load(&config)?;
             let outputs = Outputs { jsonl: jsonl.as_deref(), annotate: annotate.as_deref() };
+            let camera = config.with_file_name(&site.config.camera.calibration);
+            outputs.refuse_inputs(&[&input, &config, &camera])?;
             let source = source::open(&input, fps)?;
             print(format_args!("{}", ParcelRecord::TABLE_HEADER))?;
             let counters = offline::measure(source, site, outputs, &mut Console)?;
@@ -374,7 +377,14 @@ fn dispatch(command: Command) -> Result<()> {
 
 fn print_budget(what: &Budget) -> Result<()> {
     let site = match what {
-        Budget { config: Some(config), .. } => Site::load(config)?,
+        Budget { config: Some(config), .. } => {
+            let site = Site::load(config)?;
+            let camera = config.with_file_name(&site.config.camera.calibration);
+            if let Some(out) = &what.out {
+                refuse_inputs("--out", out, &[config, &camera])?;
+            }
+            site
+        }
         Budget {
             camera_height_mm: Some(camera_height_mm),
             focal_px: Some(focal_px),

@@ -215,6 +215,8 @@ fn surveyed_points_from_a_table() {
     refused(&calibrate("belt", &html, &folder), 2, &["camera.html", ".toml"]);
     let itself = ["--points", "points.csv", "--lens", "lens.toml", "--out", "points.csv"];
     refused(&calibrate("belt", &itself, &folder), 2, &["points.csv", "one of the inputs"]);
+    let lens = ["--points", "points.csv", "--lens", "lens.toml", "--out", "lens.toml"];
+    refused(&calibrate("belt", &lens, &folder), 2, &["lens.toml", "one of the inputs"]);
     fs::create_dir(folder.join("folder")).expect("writable");
     let special = ["--points", "points.csv", "--lens", "lens.toml", "--out", "folder"];
     refused(&calibrate("belt", &special, &folder), 2, &["not a plain file"]);

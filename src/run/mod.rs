@@ -10,6 +10,7 @@ pub mod import;
 pub mod live;
 mod memory;
 pub mod offline;
+pub mod outputs;
 pub mod privileges;
 mod realtime;
 mod report;
