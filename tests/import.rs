@@ -201,6 +201,33 @@ fn a_stick_with_settings_alone_keeps_the_camera_in_force() {
 }
 
 #[test]
+fn pipes_and_folders_in_the_store_make_nobody_wait() {
+    let (stick, store) = stick_and_store("import-pipes");
+    accepted(&stick, &store);
+    let names = ["lock", "staging", "current.new", "import.toml", "report.txt", "trust.toml"];
+    for name in names.into_iter().chain(["current/beltgauge.toml", "current/camera.toml"]) {
+        for folder in [false, true] {
+            let path = store.join(name);
+            let _ = fs::remove_file(&path);
+            let _ = fs::remove_dir_all(&path);
+            if folder {
+                fs::create_dir(&path).expect("room");
+            } else {
+                let pipe = Command::new("mkfifo").arg(&path).status();
+                assert!(pipe.is_ok_and(|status| status.success()));
+            }
+            // It ends, one way or the other, and says so.
+            let output = import(&stick, &store);
+            let said = [output.stdout, output.stderr].concat();
+            assert!(!said.is_empty(), "{name}");
+            let _ = fs::remove_file(&path);
+            let _ = fs::remove_dir_all(&path);
+        }
+    }
+    accepted(&stick, &store);
+}
+
+#[test]
 fn a_stick_that_cannot_be_written_is_imported_all_the_same() {
     let (stick, store) = stick_and_store("import-read-only");
     // A folder in its place: neither removed nor written.

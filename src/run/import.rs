@@ -7,7 +7,8 @@ use crate::config::{Config, Site};
 use crate::error::{Error, Result};
 use crate::store::manifest::MANIFEST;
 use crate::store::stick::{
-    FILE_BYTES_MAX, STILLS_BYTES_MAX, STILLS_MAX, Stick, TEXT_BYTES_MAX, is_plain_name,
+    BELT_FOLDER, FILE_BYTES_MAX, LENS_FOLDER, STILLS_BYTES_MAX, STILLS_MAX, Stick, TEXT_BYTES_MAX,
+    is_plain_name,
 };
 use crate::store::{CONFIG_FILE, Locked, REPORT, Store, Trust, files};
 use serde::Deserialize;
@@ -15,8 +16,6 @@ use std::path::{Path, PathBuf};
 
 /// How the stills of a calibration on the stick were taken.
 const CALIBRATION_FILE: &str = "calibration.toml";
-const LENS_FOLDER: &str = "lens";
-const BELT_FOLDER: &str = "belt";
 const LENS_FILE: &str = "lens.toml";
 const CAMERA_FILE: &str = "camera.toml";
 /// What a calibration gives, for the technician.

@@ -39,7 +39,9 @@ pub fn run(options: &Options<'_>) -> Result<()> {
             .map_err(|e| Error::failure(format!("cannot wait for signals: {e}")))?;
     }
     let store = Store::new(options.store);
-    store.settle();
+    if options.config.is_none() {
+        store.settle();
+    }
     let mut site = options.config.map_or_else(|| store.site(), Site::load)?;
     if options.config.is_none() {
         site.config.plc.state_file.get_or_insert_with(|| store.plc_state());

@@ -4,16 +4,14 @@
 //! times; `+3` is taken off once it works. When it does not, `beltgauge-1.efi` is started again.
 
 use crate::error::{Error, Result};
-use crate::store::stick::Stick;
+use crate::store::stick::{Stick, UPDATE_REPORT};
 use crate::store::{Locked, Store, files};
-use std::fs::{self, File};
+use std::fs;
 use std::io::Read;
 use std::path::{Path, PathBuf};
 
 /// Name of the system on the stick.
 pub(super) const IMAGE: &str = "beltgauge.efi";
-/// Name of the report on the stick.
-const REPORT: &str = "update.txt";
 /// Largest system: two of them fit the boot partition.
 const IMAGE_BYTES_MAX: u64 = 60 << 20;
 /// How often a new system is tried.
@@ -33,7 +31,7 @@ pub fn update(root: &Path, store: &Store, to: &Path) -> Result<String> {
         Ok(said) => said.clone(),
         Err(e) => format!("Refused; the system stays as it is.\nerror: {e}\n"),
     };
-    stick.leave(REPORT, said.as_bytes());
+    stick.leave(UPDATE_REPORT, said.as_bytes());
     result
 }
 
@@ -119,7 +117,7 @@ fn remove_halves(folder: &Path) -> std::io::Result<()> {
 
 /// Whether a file has these contents, without holding them twice.
 fn has_contents(path: &Path, bytes: &[u8]) -> std::io::Result<bool> {
-    let mut file = File::open(path)?;
+    let mut file = files::open(rustix::fs::CWD, path)?;
     if file.metadata()?.len() != bytes.len() as u64 {
         return Ok(false);
     }
@@ -222,7 +220,8 @@ mod tests {
         for (bytes, fits) in [(vec![], false), (pe(0x1234), false), (pe(MACHINE), true)] {
             fs::write(&image, bytes).expect("room");
             assert_eq!(update(&stick, &store, &boot).is_ok(), fits);
-            let report = fs::read_to_string(stick.join("beltgauge").join(REPORT)).expect("left");
+            let report =
+                fs::read_to_string(stick.join("beltgauge").join(UPDATE_REPORT)).expect("left");
             assert_eq!(report.starts_with("Refused"), !fits, "{report}");
         }
         assert_eq!(names(&boot), ["beltgauge-3.efi", "beltgauge-5+3.efi", "beltgauge-x.efi"]);

@@ -313,6 +313,39 @@ mod tests {
     }
 
     #[test]
+    fn a_cut_import_is_taken_back_before_its_step_and_completed_after_it() {
+        let store = store("step");
+        import(&store, "a");
+        let key = "RWQf6LRCGA9i53mlYecO4IzT51TGPpvWucNSCh1CBM0QTaLn73Y7GFO3";
+        let mut trust = Trust::default();
+        trust.public_key = Some(key.into());
+        for (stepped, result, text) in
+            [(false, ImportResult::Refused, "a"), (true, ImportResult::Applied, "b")]
+        {
+            let locked = store.lock().expect("free");
+            locked.begin().expect("room");
+            let staging = locked.stage().expect("room");
+            fs::write(staging.join(CONFIG_FILE), "b").expect("room");
+            let under_way = locked.prepare(&trust).expect("room");
+            locked.note_under_way(under_way.clone()).expect("room");
+            if stepped {
+                let site = under_way.site.expect("staged");
+                files::point(&store.root.join(CURRENT), &site).expect("room");
+            }
+            let count = store.last_import().count;
+            drop(locked); // as a power cut does: nothing else is written
+            store.settle();
+            store.settle();
+            assert_eq!(store.last_import(), ImportRecord { count: count + 1, result });
+            assert_eq!(current(&store).as_deref(), Some(text));
+            let kept = store.kept_trust().expect("readable").and_then(|kept| kept.public_key);
+            assert_eq!(kept.is_some(), stepped);
+        }
+        store.lock().expect("free").roll_back("back").expect("the one before is known");
+        assert_eq!(current(&store).as_deref(), Some("a"));
+    }
+
+    #[test]
     fn whatever_a_power_cut_left_behind_does_not_stop_the_next_import() {
         let store = store("cut");
         import(&store, "a");

@@ -199,7 +199,10 @@ impl Store {
     /// Become the one who changes it. An import that was cut off is ended first.
     pub fn lock(&self) -> Result<Locked<'_>> {
         fs::create_dir_all(&self.root).map_err(|e| self.failed(&e))?;
-        let lock = File::create(self.root.join("lock")).map_err(|e| self.failed(&e))?;
+        // Open to read and write, no pipe makes anyone wait.
+        let mut options = File::options();
+        options.create(true).truncate(false).read(true).write(true);
+        let lock = options.open(self.root.join("lock")).map_err(|e| self.failed(&e))?;
         let start = Instant::now();
         while flock(&lock, FlockOperation::NonBlockingLockExclusive).is_err() {
             if start.elapsed() > LOCK_WAIT {

@@ -1,6 +1,7 @@
 //! What a USB stick brings, read as from a stranger: plain files of a folder without links, of
 //! bounded size and number, and of one signed set if a key is in force.
 
+use super::REPORT;
 use super::files;
 use super::manifest::{MANIFEST, Manifest, SIGNATURE, another_file, sha256};
 use super::trust::Trust;
@@ -15,6 +16,12 @@ use std::rc::Rc;
 pub const FOLDER: &str = "beltgauge";
 /// The folder inside it that results are left in.
 pub const RESULTS: &str = "results";
+/// The folders inside it with stills of a calibration.
+pub const LENS_FOLDER: &str = "lens";
+/// The same of the board on the belt.
+pub const BELT_FOLDER: &str = "belt";
+/// Name of the report on an update.
+pub const UPDATE_REPORT: &str = "update.txt";
 /// Largest text file.
 pub const TEXT_BYTES_MAX: u64 = 256 << 10;
 /// Largest file at all: a still or a system.
@@ -27,10 +34,8 @@ pub const STILLS_MAX: usize = 60;
 const ENTRIES_MAX: usize = 1000;
 /// Most names that a report lists.
 const NAMES_TOLD: usize = 12;
-/// Folders whose files belong to a set.
-const SET_FOLDERS: [&str; 2] = ["lens", "belt"];
-/// Files that the appliance leaves, and so no part of a set.
-const LEFT: [&str; 2] = ["report.txt", "update.txt"];
+/// Files that are no part of a set: what the appliance leaves, and the manifest itself.
+const NO_PART: [&str; 4] = [REPORT, UPDATE_REPORT, MANIFEST, SIGNATURE];
 /// How folders are opened; never through a link.
 const FOLDER_FLAGS: OFlags =
     OFlags::RDONLY.union(OFlags::DIRECTORY).union(OFlags::CLOEXEC).union(OFlags::NOFOLLOW);
@@ -220,12 +225,8 @@ impl Stick {
     /// Names of the files that a manifest lists.
     pub(super) fn set(&self) -> Result<Vec<String>> {
         let mut set = self.names()?;
-        set.retain(|name| {
-            let no_part =
-                LEFT.contains(&name.as_str()) || [MANIFEST, SIGNATURE].contains(&name.as_str());
-            !no_part && self.plain(name).is_ok()
-        });
-        for name in SET_FOLDERS {
+        set.retain(|name| !NO_PART.contains(&name.as_str()) && self.plain(name).is_ok());
+        for name in [LENS_FOLDER, BELT_FOLDER] {
             if let Some(folder) = self.folder(name) {
                 set.extend(folder.names()?.into_iter().map(|file| format!("{name}/{file}")));
             }
