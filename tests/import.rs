@@ -170,6 +170,14 @@ fn what_is_nearly_ours_is_told_by_name() {
     refused(&stick, &store, &["is called Beltgauge (1)", "rename it"]);
     let said = fs::read_to_string(nearly.join("report.txt")).expect("left there");
     assert!(said.contains("In the folder Beltgauge (1)"), "{said}");
+    // A folder with a system alone is told the same.
+    let system = stick.join("beltgauge-old");
+    fs::create_dir(&system).expect("room");
+    fs::write(system.join("beltgauge.efi"), "MZ").expect("room");
+    fs::rename(&nearly, stick.join("aside")).expect("same disk");
+    refused(&stick, &store, &["is called beltgauge-old"]);
+    fs::remove_dir_all(&system).expect("there");
+    fs::rename(stick.join("aside"), &nearly).expect("same disk");
     // Another case is no other name: FAT does not know it.
     fs::rename(&nearly, stick.join("BeltGauge")).expect("same disk");
     assert!(import(&stick, &store).status.success());

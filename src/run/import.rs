@@ -61,7 +61,7 @@ impl Board {
 /// error that is noted nowhere: it is somebody else's.
 pub fn import(root: &Path, store: &Store) -> Result<String> {
     let mut stick = Stick::open(root)?;
-    if stick.has(update::IMAGE) && !is_for_import(&stick) {
+    if stick.check_name().is_ok() && stick.has(update::IMAGE) && !is_for_import(&stick) {
         return Ok(format!(
             "There is no {CONFIG_FILE} on the stick: the configuration stays in force.\n"
         ));
