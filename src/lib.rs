@@ -14,7 +14,8 @@
 //! - [`kernel`]: pixel loops on slices, a readable one and one in vectors. [`stage`]: the steps that own state.
 //! - [`belt`]: where the belt is. [`pipeline`]: the steps in order. [`event`]: what comes out.
 //! - [`source`]: where frames come from. [`plc`]: how records reach the PLC.
-//! - [`run`]: threads and rings; the only room that knows source, pipeline and plc.
+//! - [`store`]: the appliance's disk: configurations in force, sticks, whom it trusts.
+//! - [`run`]: threads and rings; the only room that knows source, pipeline, plc and store.
 //!
 //! Invariants: `pipeline::step` reads no clock and allocates nothing; a record is emitted
 //! once; dependencies point one way (`tests/tidy.rs` checks it).
@@ -35,4 +36,5 @@ pub mod plc;
 pub mod run;
 pub mod source;
 pub mod stage;
+pub mod store;
 pub mod units;

@@ -3,13 +3,14 @@
 use beltgauge::camera::LensModel;
 use beltgauge::camera::chessboard::Chessboard;
 use beltgauge::config::Site;
-use beltgauge::config::store::Store;
 use beltgauge::error::{Error, Result};
 use beltgauge::event::ParcelRecord;
 use beltgauge::run::budget::{self, StraightDown};
 use beltgauge::run::calibrate::{self, DataSheet};
 use beltgauge::run::offline::{self, Observer, Outputs};
+use beltgauge::run::outputs::refuse_inputs;
 use beltgauge::run::{demo, import, live, log, privileges, update};
+use beltgauge::store::{Store, manifest};
 use beltgauge::{run, source};
 use clap::{Parser, Subcommand};
 use std::io::{IsTerminal, Write};
@@ -107,6 +108,14 @@ enum Command {
         /// Folder to put configurations into.
         #[arg(long, default_value = STORE)]
         store: PathBuf,
+    },
+    /// List the files of a stick with their digests, to be signed as one set.
+    Manifest {
+        /// The stick: a folder with a folder `beltgauge` in it.
+        dir: PathBuf,
+        /// Higher than that of every set before, for example the date and a number: 2026112601.
+        #[arg(long)]
+        counter: u64,
     },
     /// Put the new system on a stick into the boot partition, to be tried at the next start.
     Update {
@@ -313,6 +322,8 @@ fn dispatch(command: Command) -> Result<()> {
         Command::Measure { input, config, fps, jsonl, annotate } => {
             let site = Site::load(&config)?;
             let outputs = Outputs { jsonl: jsonl.as_deref(), annotate: annotate.as_deref() };
+            let camera = config.with_file_name(&site.config.camera.calibration);
+            outputs.refuse_inputs(&[&input, &config, &camera])?;
             let source = source::open(&input, fps)?;
             print(format_args!("{}", ParcelRecord::TABLE_HEADER))?;
             let counters = offline::measure(source, site, outputs, &mut Console)?;
@@ -334,12 +345,18 @@ fn dispatch(command: Command) -> Result<()> {
             };
             print(format_args!("{}", report.trim_end()))
         }
+        Command::Manifest { dir, counter } => {
+            print(format_args!("{}", manifest::make(&dir, counter)?))
+        }
         Command::Update { dir, store, to } => {
             let report = update::update(&dir, &Store::new(&store), &to)?;
             print(format_args!("{}", report.trim_end()))
         }
         Command::Check { config, store } => {
-            let site = Site::load(&config.unwrap_or_else(|| Store::new(&store).config()))?;
+            let site = match config {
+                Some(config) => Site::load(&config),
+                None => Store::new(&store).site(),
+            }?;
             let plan = run::plan(&site);
             print(format_args!("{plan}"))?;
             plan.check_limit(site.config.limits.memory_mib_max)?;
@@ -350,7 +367,14 @@ fn dispatch(command: Command) -> Result<()> {
 
 fn print_budget(what: &Budget) -> Result<()> {
     let site = match what {
-        Budget { config: Some(config), .. } => Site::load(config)?,
+        Budget { config: Some(config), .. } => {
+            let site = Site::load(config)?;
+            let camera = config.with_file_name(&site.config.camera.calibration);
+            if let Some(out) = &what.out {
+                refuse_inputs("--out", out, &[config, &camera])?;
+            }
+            site
+        }
         Budget {
             camera_height_mm: Some(camera_height_mm),
             focal_px: Some(focal_px),

@@ -369,6 +369,52 @@ fn a_start_that_fails_leaves_earlier_records_alone() {
 }
 
 #[test]
+fn outputs_over_inputs_are_refused_before_anything_is_written() {
+    let folder = scratch("over_inputs");
+    let config = write_site(&folder, SIZE);
+    let (input, camera) = (folder.join("input.y4m"), folder.join("camera.toml"));
+    write_y4m(&input, 1);
+    let link = folder.join("link");
+    std::os::unix::fs::symlink(&config, &link).expect("writable");
+    let before = [&input, &config, &camera].map(|path| fs::read(path).expect("there"));
+    for output in [&input, &config, &camera, &link] {
+        refused(
+            &["measure".as_ref(), &input, "--config".as_ref(), &config, "--jsonl".as_ref(), output],
+            2,
+            &["--jsonl", "is one of the inputs"],
+        );
+    }
+    let budget = ["budget", "--fps", "40", "--config"].map(Path::new);
+    for output in [&config, &camera] {
+        let more = [&config, Path::new("--out"), output];
+        refused(&[&budget[..], &more].concat(), 2, &["--out", "is one of the inputs"]);
+    }
+    // What standard input reads from, and a folder of frames.
+    let stdin = fs::File::open(&input).expect("there");
+    let output = run(beltgauge()
+        .args(["measure", "-", "--config"])
+        .arg(&config)
+        .arg("--jsonl")
+        .arg(&input)
+        .stdin(stdin));
+    assert_eq!(output.status.code(), Some(2));
+    refused(
+        &[
+            "measure".as_ref(),
+            &folder,
+            "--config".as_ref(),
+            &config,
+            "--annotate".as_ref(),
+            &folder,
+        ],
+        2,
+        &["--annotate", "is one of the inputs"],
+    );
+    let after = [&input, &config, &camera].map(|path| fs::read(path).expect("there"));
+    assert_eq!(after, before);
+}
+
+#[test]
 fn a_reader_that_hangs_up_is_no_crash() {
     let config = write_site(&scratch("hang_up"), SIZE);
     let full = fs::OpenOptions::new().write(true).open("/dev/full").expect("Linux");

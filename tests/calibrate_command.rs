@@ -13,7 +13,8 @@ use nalgebra::{Matrix3, Rotation3, Vector3};
 use scene::{Shot, photograph, pose};
 use std::fs;
 use std::path::{Path, PathBuf};
-use std::process::Output;
+use std::process::{Output, Stdio};
+use std::time::{Duration, Instant};
 
 const SIZE: [usize; 2] = [800, 600];
 
@@ -215,6 +216,8 @@ fn surveyed_points_from_a_table() {
     refused(&calibrate("belt", &html, &folder), 2, &["camera.html", ".toml"]);
     let itself = ["--points", "points.csv", "--lens", "lens.toml", "--out", "points.csv"];
     refused(&calibrate("belt", &itself, &folder), 2, &["points.csv", "one of the inputs"]);
+    let lens = ["--points", "points.csv", "--lens", "lens.toml", "--out", "lens.toml"];
+    refused(&calibrate("belt", &lens, &folder), 2, &["lens.toml", "one of the inputs"]);
     fs::create_dir(folder.join("folder")).expect("writable");
     let special = ["--points", "points.csv", "--lens", "lens.toml", "--out", "folder"];
     refused(&calibrate("belt", &special, &folder), 2, &["not a plain file"]);
@@ -262,23 +265,49 @@ fn a_stick_with_stills_is_calibrated_as_it_is_imported() {
     fs::write(stick.join("beltgauge.toml"), config).expect("writable");
     let board = "board = [5, 8]\nsquare_mm = 30\nboard_thickness_mm = 3\n";
     fs::write(stick.join("calibration.toml"), board).expect("writable");
-    let import = || {
-        let store = root.join("store");
-        run(beltgauge().arg("import").arg(root.join("stick")).arg("--store").arg(store))
+    let (store, temporary) = (root.join("store"), root.join("tmp"));
+    fs::create_dir(&temporary).expect("writable");
+    let command = || {
+        let mut command = beltgauge();
+        command.arg("import").arg(root.join("stick")).arg("--store").arg(&store);
+        command.env("TMPDIR", &temporary);
+        command
     };
+    let import = || run(&mut command());
+    // Killed while it computes: the next one removes what it left, and says so.
+    let left = || fs::read_dir(&temporary).expect("there").count();
+    let mut killed = command().stderr(Stdio::null()).spawn().expect("starts");
+    let start = Instant::now();
+    while left() == 0 {
+        assert!(start.elapsed() < Duration::from_mins(1), "it never began");
+        std::thread::sleep(Duration::from_millis(1));
+    }
+    killed.kill().expect("it runs");
+    killed.wait().expect("it ended");
+    assert!(left() == 1 && !store.join("current").exists());
     let output = import();
     assert_eq!(output.status.code(), Some(0), "{}", text(&output.stderr));
+    assert!(left() == 0 && text(&output.stderr).contains("cut off"), "{}", text(&output.stderr));
+    let record = fs::read_to_string(store.join("import.toml")).expect("kept");
+    assert!(record.contains("count = 2"), "{record}");
     let report = text(&output.stdout);
     assert!(report.contains("view_07.png") && report.contains("is in force"), "{report}");
     let camera = CameraFile::load(&root.join("store/current/camera.toml")).expect("a camera");
     // As in the test above.
     assert!((camera.centre_in_belt().z - HEIGHT_MM).abs() < 1.5, "{camera:?}");
+    // What it came to is left on the stick, and does not stand in for the next calibration.
+    let results = stick.join("results");
+    let result = |name: &str| fs::read(results.join(name)).expect("left");
+    assert_eq!(result("camera.toml"), fs::read(store.join("current/camera.toml")).expect("there"));
+    assert!(["lens.toml", "lens.html", "camera.html"].iter().all(|name| !result(name).is_empty()));
+    fs::remove_dir_all(&results).expect("there");
     // A still that is none is rejected with its reason; no still of the belt is an error.
     fs::write(stick.join("lens/view_03.png"), "no picture").expect("writable");
     refused(&import(), 1, &["view_03.png"]);
     fs::remove_dir_all(stick.join("belt")).expect("there");
     fs::remove_file(stick.join("lens/view_03.png")).expect("there");
     refused(&import(), 2, &["belt", "no stills"]);
+    assert!(results.join("lens.html").exists(), "the lens is told all the same");
     fs::write(stick.join("calibration.toml"), "board = [1, 8]\nsquare_mm = 30\n")
         .expect("writable");
     refused(&import(), 2, &["calibration.toml", "3 to 60 inner corners"]);

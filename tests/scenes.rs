@@ -414,12 +414,15 @@ fn a_truncated_recording_keeps_what_was_measured_before() {
         y4m.extend(&frame);
     }
     let jsonl = folder.join("parcels.jsonl");
+    let pictures = folder.join("pictures");
     let measure = |bytes: &[u8]| {
         let mut child = common::beltgauge()
             .args(["measure", "-", "--config"])
             .arg(folder.join("beltgauge.toml"))
             .arg("--jsonl")
             .arg(&jsonl)
+            .arg("--annotate")
+            .arg(&pictures)
             .stdin(std::process::Stdio::piped())
             .stdout(std::process::Stdio::null())
             .stderr(std::process::Stdio::null())
@@ -436,6 +439,11 @@ fn a_truncated_recording_keeps_what_was_measured_before() {
     assert_eq!(whole.lines().next(), cut.lines().next());
     assert!(cut.lines().count() >= 2, "the unfinished ones are written too:\n{cut}");
     assert_json_contract(cut.lines().next().expect("a line"));
+    // A picture that cannot be written is told in the end, and costs no record and no other picture.
+    std::fs::remove_dir_all(&pictures).expect("written");
+    std::fs::create_dir_all(pictures.join("parcel_0001.png")).expect("writable");
+    assert_eq!(measure(&y4m), (Some(1), whole));
+    assert!(pictures.join("parcel_0002.png").is_file());
 }
 
 /// The fields that users read, in their order.

@@ -24,6 +24,7 @@ const MAY_USE: &[(&str, &[&str])] = &[
     ),
     ("source", &["camera", "config", "plan", "image", "units", "error"]),
     ("plc", &["config", "event", "error"]),
+    ("store", &["camera", "config", "error"]),
 ];
 
 /// The only places for `unsafe`.

@@ -75,9 +75,13 @@ impl CameraFile {
                 .in_file(path)
                 .remedy(remedy)
         })?;
-        toml::from_str(&text).map_err(|e| {
+        Self::parse(&text).map_err(|e| e.in_file(path))
+    }
+
+    /// Parse the text of a camera file.
+    pub fn parse(text: &str) -> Result<Self> {
+        toml::from_str(text).map_err(|e| {
             Error::configuration(format!("not a camera calibration: {}", e.to_string().trim_end()))
-                .in_file(path)
                 .remedy("correct the line shown; config/example has a whole file")
         })
     }

@@ -2,12 +2,10 @@
 //! unknown keys are refused; a wrong value names file, key, value, allowed range and remedy.
 
 mod schema;
-pub mod stick;
-pub mod store;
 
 pub use schema::{
     Background, CameraTable, Can, Config, DimensionOrder, Encoder, Import, Interface, Limits,
-    Measure, Modbus, Odometry, Plc, Realtime, Segment, View, WordOrder,
+    Measure, Modbus, Odometry, Plc, Realtime, Segment, View, WordOrder, public_key,
 };
 
 use crate::camera::{BeltView, Camera, CameraFile};

@@ -1,8 +1,8 @@
 //! The keys of the configuration file, their defaults and ranges.
 
-use super::stick::public_key;
 use crate::error::{Error, Result};
 use crate::units::BeltRect;
+use minisign_verify::PublicKey;
 use serde::Deserialize;
 use std::net::{IpAddr, SocketAddr};
 use std::path::PathBuf;
@@ -421,8 +421,17 @@ impl Default for Encoder {
 #[derive(Clone, Debug, Default, PartialEq, Eq, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct Import {
-    /// Only files signed with the secret key that belongs to this one (minisign) are accepted.
+    /// Only sets signed with the secret key that belongs to this one (minisign) are accepted.
     pub public_key: Option<String>,
+}
+
+/// A public key of minisign, as its `.pub` file has it in the last line.
+pub fn public_key(text: &str) -> Result<PublicKey> {
+    PublicKey::from_base64(text).map_err(|e| {
+        Error::configuration(format!("import.public_key = {text:?}: {e}"))
+            .allowed("the last line of minisign's .pub file")
+            .remedy("make a pair of keys with `minisign -G`")
+    })
 }
 
 impl Config {

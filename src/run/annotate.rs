@@ -25,6 +25,10 @@ pub struct Annotator {
     size_px: [usize; 2],
     /// By frame: the raw image. Frames that no parcel refers to are dropped.
     kept: HashMap<u64, Vec<u8>>,
+    pictures: u64,
+    /// Pictures that could not be written, and why the first could not.
+    missing: u64,
+    first_error: Option<Error>,
 }
 
 impl Annotator {
@@ -33,26 +37,39 @@ impl Annotator {
         std::fs::create_dir_all(folder).map_err(|e| {
             Error::failure(format!("cannot create the picture folder: {e}")).in_file(folder)
         })?;
-        Ok(Self { folder: folder.to_owned(), size_px, kept: HashMap::new() })
+        let (kept, first_error) = Default::default();
+        let folder = folder.to_owned();
+        Ok(Self { folder, size_px, kept, pictures: 0, missing: 0, first_error })
     }
 
-    /// Draw the records that a frame emitted, then keep it if parcels refer to it.
-    pub fn frame(
-        &mut self,
-        raw: &[u8],
-        index: u64,
-        pipeline: &Pipeline,
-        records: &[ParcelRecord],
-    ) -> Result<()> {
+    /// Draw the records that a frame emitted, then keep it if parcels refer to it. A picture that
+    /// cannot be written is counted: it is no reason to stop measuring.
+    pub fn frame(&mut self, raw: &[u8], index: u64, pipeline: &Pipeline, records: &[ParcelRecord]) {
         for record in records {
             let frame = self.kept.get(&record.frame).map_or(raw, Vec::as_slice);
-            draw(frame, self.size_px, record, &pipeline.site().camera, &self.folder)?;
+            let drawn = draw(frame, self.size_px, record, &pipeline.site().camera, &self.folder);
+            self.pictures += 1;
+            if let Err(e) = drawn {
+                self.missing += 1;
+                self.first_error.get_or_insert(e);
+            }
         }
         self.kept.retain(|&kept, _| pipeline.reference_frames().any(|(_, f)| f == kept));
         if pipeline.reference_frames().any(|(_, f)| f == index) {
             self.kept.insert(index, raw.to_vec());
         }
-        Ok(())
+    }
+
+    /// Whether every picture was written.
+    ///
+    /// # Errors
+    /// Says how many were not, and why the first was not.
+    pub fn finish(self) -> Result<()> {
+        let (pictures, missing) = (self.pictures, self.missing);
+        self.first_error.map_or(Ok(()), |first| {
+            Err(Error::failure(format!("{missing} of {pictures} pictures are missing: {first}"))
+                .remedy("the records are complete; make room and run again for the pictures"))
+        })
     }
 }
 
@@ -102,7 +119,11 @@ pub fn draw(
     );
     let path = folder.join(format!("parcel_{:04}.png", record.seq));
     image::save_buffer(&path, &canvas.rgb, width as u32, height as u32, image::ColorType::Rgb8)
-        .map_err(|e| Error::failure(format!("cannot write the picture: {e}")).in_file(&path))
+        .map_err(|e| {
+            // Half a picture is none.
+            let _ = std::fs::remove_file(&path);
+            Error::failure(format!("cannot write the picture: {e}")).in_file(&path)
+        })
 }
 
 /// An RGB picture to draw on.

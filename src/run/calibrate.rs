@@ -1,6 +1,7 @@
 //! `beltgauge calibrate`: stills or surveyed points in; a camera file, and beside it its report
 //! as HTML, out.
 
+use super::outputs::refuse_inputs;
 use super::report;
 use crate::camera::calibrate::{
     BeltCalibration, BeltStill, BoardShape, LensCalibration, LensStart, SurveyedPoint,
@@ -86,7 +87,7 @@ pub fn belt(
     let lens = CameraFile::load_lens(lens_file)?;
     let carried = files_of(carried)?;
     let elsewhere = files_of(elsewhere)?;
-    let page = report_beside(out, &[&carried, &elsewhere])?;
+    let page = report_beside(out, &[&carried, &elsewhere, &[lens_file.to_owned()]])?;
     let files = [&carried[..], &elsewhere].concat();
     let shots = look(&files, Some(lens.image_size_px), board, say)?;
     let mut stills = Vec::with_capacity(shots.len());
@@ -134,7 +135,7 @@ pub fn points(
     out: &Path,
     say: &mut dyn FnMut(&str) -> Result<()>,
 ) -> Result<Vec<String>> {
-    let page = report_beside(out, &[&[csv.to_owned()]])?;
+    let page = report_beside(out, &[&[csv.to_owned(), lens_file.to_owned()]])?;
     let lens = CameraFile::load_lens(lens_file)?;
     let points = read_points(csv)?;
     let calibration = calibrate_points(&lens, &points).map_err(|e| e.in_file(csv))?;
@@ -307,10 +308,8 @@ fn report_beside(out: &Path, inputs: &[&[PathBuf]]) -> Result<PathBuf> {
         if std::fs::symlink_metadata(file).is_ok_and(|m| !m.is_file()) {
             return refused("--out, or its report beside it, is not a plain file");
         }
-        let same = |input: &PathBuf| matches!((input.canonicalize(), file.canonicalize()), (Ok(a), Ok(b)) if a == b);
-        if inputs.iter().copied().flatten().any(same) {
-            return refused("--out, or its report beside it, is one of the inputs");
-        }
+        let inputs: Vec<&Path> = inputs.iter().copied().flatten().map(PathBuf::as_path).collect();
+        refuse_inputs("--out, or its report beside it,", file, &inputs)?;
     }
     if page == out {
         return Err(Error::configuration("--out would be overwritten by its own report")

@@ -1,23 +1,27 @@
 //! `beltgauge import`: from a USB stick into the store of configurations, completely checked.
 
-use super::calibrate;
+use super::{calibrate, update};
 use crate::camera::LensModel;
 use crate::camera::chessboard::Chessboard;
-use crate::config::stick::{
-    self, STILL_BYTES_MAX, STILLS_BYTES_MAX, STILLS_MAX, Stick, is_plain_name,
-};
-use crate::config::store::{CONFIG_FILE, ImportResult, Locked, REPORT, Store};
 use crate::config::{Config, Site};
 use crate::error::{Error, Result};
+use crate::store::manifest::MANIFEST;
+use crate::store::stick::{
+    BELT_FOLDER, FILE_BYTES_MAX, LENS_FOLDER, STILLS_BYTES_MAX, STILLS_MAX, Stick, TEXT_BYTES_MAX,
+    is_plain_name,
+};
+use crate::store::{CONFIG_FILE, Locked, REPORT, Store, Trust, files};
 use serde::Deserialize;
-use std::fmt::Write as _;
 use std::path::{Path, PathBuf};
 
 /// How the stills of a calibration on the stick were taken.
 const CALIBRATION_FILE: &str = "calibration.toml";
-const LENS_FOLDER: &str = "lens";
-const BELT_FOLDER: &str = "belt";
 const LENS_FILE: &str = "lens.toml";
+const CAMERA_FILE: &str = "camera.toml";
+/// What a calibration gives, for the technician.
+const RESULTS: [&str; 4] = [LENS_FILE, "lens.html", CAMERA_FILE, "camera.html"];
+/// Largest report of a calibration: it holds pictures.
+const RESULT_BYTES_MAX: u64 = 64 << 20;
 
 /// `calibration.toml` on the stick: the board of the stills in `lens/` and `belt/`.
 #[derive(Debug, Deserialize)]
@@ -53,85 +57,158 @@ impl Board {
 }
 
 /// Import what is in the folder `beltgauge` of `root`. The report says what came of it, whether that
-/// is an error or not, and is left in the store and on the stick.
+/// is an error or not, and is left in the store and on the stick. A stick without such a folder is an
+/// error that is noted nowhere: it is somebody else's.
 pub fn import(root: &Path, store: &Store) -> Result<String> {
+    let mut stick = Stick::open(root)?;
+    if stick.check_name().is_ok() && stick.has(update::IMAGE) && !is_for_import(&stick) {
+        return Ok(format!(
+            "There is no {CONFIG_FILE} on the stick: the configuration stays in force.\n"
+        ));
+    }
     let locked = store.lock()?;
-    let mut report = String::new();
-    // A stick that stays plugged in is imported at every start: what is in force already stays.
-    let result = stage(root, store, &locked, &mut report)
-        .and_then(|()| if locked.is_in_force() { Ok(()) } else { locked.apply() });
-    match &result {
-        Ok(()) => report.push_str("The configuration is in force.\n"),
-        Err(e) => {
-            let _ =
-                writeln!(report, "Refused; the configuration before stays in force.\nerror: {e}");
+    let mut report = Report::default();
+    let result = locked.begin().and_then(|()| {
+        let trust = stage(&mut stick, &locked, &mut report)?;
+        let text = format!("{}The configuration is in force.\n", report.text);
+        locked.apply(&trust, &text)?;
+        report.text = text;
+        Ok(())
+    });
+    if let Err(e) = &result {
+        report.text = format!(
+            "Refused; the configuration before stays in force.\nerror: {e}\n{}\
+             In the folder {} of the stick: {}\n\
+             Expected: {CONFIG_FILE}, and the camera file that it names if that is another one\n",
+            report.text,
+            stick.name(),
+            stick.contents()
+        );
+        if let Err(e) = locked.refuse(&report.text) {
+            tracing::warn!("{e}");
         }
     }
-    let outcome = if result.is_ok() { ImportResult::Applied } else { ImportResult::Refused };
-    locked.note(outcome, &report)?;
-    if let Ok(stick) = Stick::open(root, None) {
-        stick.leave(REPORT, &report);
+    stick.leave(REPORT, report.text.as_bytes());
+    for (name, bytes) in &report.results {
+        stick.leave_result(name, bytes);
     }
-    result.map(|()| report)
+    result.map(|()| report.text)
 }
 
-/// Put the configuration before the one in force in force again.
+/// What an import tells.
+#[derive(Default)]
+struct Report {
+    text: String,
+    /// Files that a calibration gave, by name.
+    results: Vec<(&'static str, Vec<u8>)>,
+}
+
+impl Report {
+    fn line(&mut self, line: &str) {
+        self.text.push_str(line);
+        self.text.push('\n');
+    }
+}
+
+/// Whether a stick with an update brings a configuration too, or what was meant to be one.
+fn is_for_import(stick: &Stick) -> bool {
+    let names = stick.names().unwrap_or_default();
+    names.iter().any(|name| name.to_lowercase().contains(".toml") && !name.starts_with(MANIFEST))
+}
+
+/// Put the configuration before the one in force in force again. The key in force stays.
 pub fn roll_back(store: &Store) -> Result<String> {
-    let locked = store.lock()?;
-    locked.roll_back()?;
     let report = "The configuration before is in force again.\n";
-    locked.note(ImportResult::RolledBack, report)?;
+    store.lock()?.roll_back(report)?;
     Ok(report.to_owned())
 }
 
-/// Copy, calibrate if there are stills, and check.
-fn stage(root: &Path, store: &Store, locked: &Locked<'_>, report: &mut String) -> Result<()> {
-    let key = key_in_force(store)?;
-    let stick = Stick::open(root, key)?;
+/// Copy, calibrate if there are stills, and check. Returns whom to trust from then on.
+fn stage(stick: &mut Stick, locked: &Locked<'_>, report: &mut Report) -> Result<Trust> {
+    stick.check_name()?;
+    let mut trust = locked.store().trust()?;
+    stick.seal(&mut trust)?;
+    if !stick.has(CONFIG_FILE) {
+        return Err(Error::configuration(format!("there is no file {CONFIG_FILE}"))
+            .in_file(stick.path())
+            .allowed(format!("a plain file with exactly this name: {CONFIG_FILE}"))
+            .remedy("rename it; Windows hides the ends of names, such as a second one .txt"));
+    }
     let text = stick.read_text(CONFIG_FILE)?;
-    let on_stick = root.join(stick::FOLDER).join(CONFIG_FILE);
+    let on_stick = stick.path().join(CONFIG_FILE);
     let config = Config::parse(&text).map_err(|e| e.in_file(&on_stick))?;
     check_names(&config).map_err(|e| e.in_file(&on_stick))?;
     let staging = locked.stage()?;
-    let save = |name: &Path, bytes: &[u8]| {
-        std::fs::write(staging.join(name), bytes)
-            .map_err(|e| Error::failure(format!("cannot write: {e}")).in_file(&staging.join(name)))
-    };
-    save(Path::new(CONFIG_FILE), text.as_bytes())?;
+    save(&staging.join(CONFIG_FILE), text.as_bytes())?;
     let camera = &config.camera.calibration;
     let name = camera.to_str().unwrap_or_default();
     if stick.has(CALIBRATION_FILE) && !stick.has(name) {
-        calibrate_stills(&stick, &staging, camera, report)?;
+        let scratch = Scratch(locked.scratch()?);
+        let made = calibrate_stills(stick, &scratch, report);
+        report.results = scratch.results();
+        made?;
+        let made = scratch.0.join(CAMERA_FILE);
+        std::fs::copy(&made, staging.join(camera))
+            .map_err(|e| Error::failure(format!("cannot copy: {e}")).in_file(&made))?;
     } else {
-        save(camera, stick.read_text(name)?.as_bytes())?;
+        save(&staging.join(camera), &camera_file(stick, locked.store(), camera, report)?)?;
     }
     let site = Site::load(&staging.join(CONFIG_FILE))?;
     let plan = super::plan(&site);
     plan.check_limit(site.config.limits.memory_mib_max)?;
     let [width, height] = site.camera.image_size_px;
-    let _ = writeln!(
-        report,
+    report.line(&format!(
         "{CONFIG_FILE} and {name}: {width} x {height} px, zone {:.0} to {:.0} mm along, {:.0} to {:.0} mm across, {:.0} MiB",
         site.config.zone.x_min_mm,
         site.config.zone.x_max_mm,
         site.config.zone.y_min_mm,
         site.config.zone.y_max_mm,
         plan.bytes() as f64 / f64::from(1 << 20),
-    );
-    Ok(())
+    ));
+    tell_key(&mut trust, &config, report);
+    Ok(trust)
 }
 
-/// The key that the configuration in force asks for. When that cannot be read, nothing is accepted:
-/// a damaged file must not open the door.
-pub(super) fn key_in_force(store: &Store) -> Result<Option<minisign_verify::PublicKey>> {
-    let path = store.config();
-    let text = match std::fs::read_to_string(&path) {
-        Ok(text) => text,
-        Err(e) if e.kind() == std::io::ErrorKind::NotFound => return Ok(None),
-        Err(e) => return Err(Error::failure(format!("cannot read: {e}")).in_file(&path)),
-    };
-    let config = Config::parse(&text).map_err(|e| e.in_file(&path))?;
-    config.import.public_key.as_deref().map(stick::public_key).transpose()
+/// The camera file on the stick; without one, that in force: the camera stays when settings change.
+fn camera_file(
+    stick: &Stick,
+    store: &Store,
+    camera: &Path,
+    report: &mut Report,
+) -> Result<Vec<u8>> {
+    let name = camera.to_str().unwrap_or_default();
+    match stick.read(name, TEXT_BYTES_MAX) {
+        Err(_) if !stick.exists(name) => {
+            let in_force = store.file_in_force(camera).ok_or_else(|| {
+                Error::configuration(format!("{name} is neither on the stick nor in force"))
+                    .in_file(&stick.path().join(name))
+                    .remedy("put the camera file on the stick, or correct camera.calibration")
+            })?;
+            report.line(&format!("{name} is not on the stick: the one in force is used"));
+            Ok(in_force)
+        }
+        read => read,
+    }
+}
+
+/// The key that the configuration names comes in force. One that names none changes nothing: a line
+/// that was forgotten must not open the door.
+fn tell_key(trust: &mut Trust, config: &Config, report: &mut Report) {
+    match &config.import.public_key {
+        Some(key) if trust.public_key.as_ref() != Some(key) => {
+            report.line(&format!("From now on sets must be signed with the key {key}"));
+            trust.public_key = Some(key.clone());
+        }
+        None if trust.public_key.is_some() => {
+            report.line("import.public_key is not given: the key in force stays");
+        }
+        _ => {}
+    }
+}
+
+fn save(path: &Path, bytes: &[u8]) -> Result<()> {
+    std::fs::write(path, bytes)
+        .map_err(|e| Error::failure(format!("cannot write: {e}")).in_file(path))
 }
 
 /// The stick's configuration may name files of its own folder only.
@@ -151,20 +228,14 @@ fn check_names(config: &Config) -> Result<()> {
     Ok(())
 }
 
-/// Make the camera file from the stills on the stick.
-fn calibrate_stills(
-    stick: &Stick,
-    staging: &Path,
-    camera: &Path,
-    report: &mut String,
-) -> Result<()> {
+/// Make lens and camera file from the stills on the stick.
+fn calibrate_stills(stick: &Stick, scratch: &Scratch, report: &mut Report) -> Result<()> {
     let board =
         Board::parse(&stick.read_text(CALIBRATION_FILE)?).map_err(|e| e.at(CALIBRATION_FILE))?;
     let chessboard = Chessboard::new(board.board, board.square_mm);
-    let scratch = Scratch::new()?;
     let lens = scratch.0.join(LENS_FILE);
     let mut say = |line: &str| {
-        let _ = writeln!(report, "{line}");
+        report.line(line);
         Ok(())
     };
     let mut warnings = Vec::new();
@@ -174,8 +245,7 @@ fn calibrate_stills(
             let (board, model) = (&chessboard, board.model);
             warnings.extend(calibrate::lens(&stills, board, model, None, &lens, &mut say)?);
         }
-        None => std::fs::write(&lens, stick.read_text(LENS_FILE)?)
-            .map_err(|e| Error::failure(format!("cannot write: {e}")).in_file(&lens))?,
+        None => save(&lens, stick.read_text(LENS_FILE)?.as_bytes())?,
     }
     let belt = stick.folder(BELT_FOLDER).ok_or_else(|| {
         Error::configuration("there are no stills of the board on the belt")
@@ -183,7 +253,7 @@ fn calibrate_stills(
             .remedy("put the camera file, or stills into the folder belt/, on the stick")
     })?;
     let stills = scratch.copy(&belt, BELT_FOLDER)?;
-    let (out, thickness_mm) = (scratch.0.join("camera.toml"), board.board_thickness_mm);
+    let (out, thickness_mm) = (scratch.0.join(CAMERA_FILE), board.board_thickness_mm);
     warnings.extend(calibrate::belt(
         &stills,
         &[],
@@ -194,22 +264,19 @@ fn calibrate_stills(
         &mut say,
     )?);
     for warning in warnings {
-        let _ = writeln!(report, "warning: {warning}");
+        report.line(&format!("warning: {warning}"));
     }
-    std::fs::copy(&out, staging.join(camera))
-        .map(drop)
-        .map_err(|e| Error::failure(format!("cannot write: {e}")).in_file(camera))
+    Ok(())
 }
 
-/// A folder for stills, removed in the end.
+/// A folder for stills and results, removed in the end.
 struct Scratch(PathBuf);
 
 impl Scratch {
-    fn new() -> Result<Self> {
-        let path = std::env::temp_dir().join(format!("beltgauge-import-{}", std::process::id()));
-        std::fs::create_dir(&path)
-            .map_err(|e| Error::failure(format!("cannot make a folder: {e}")).in_file(&path))?;
-        Ok(Self(path))
+    /// What there is for the technician.
+    fn results(&self) -> Vec<(&'static str, Vec<u8>)> {
+        let read = |name| Some((name, files::read(&self.0.join(name), RESULT_BYTES_MAX).ok()?));
+        RESULTS.into_iter().filter_map(read).collect()
     }
 
     fn copy(&self, from: &Stick, name: &str) -> Result<Vec<PathBuf>> {
@@ -227,7 +294,7 @@ impl Scratch {
         std::fs::create_dir(&folder).map_err(failed)?;
         let mut room = STILLS_BYTES_MAX;
         for still in &names {
-            let bytes = from.read(still, STILL_BYTES_MAX.min(room))?;
+            let bytes = from.read(still, FILE_BYTES_MAX.min(room))?;
             room -= bytes.len() as u64;
             std::fs::write(folder.join(still), bytes).map_err(failed)?;
         }

@@ -1,13 +1,13 @@
 //! `beltgauge run`: the appliance on a live camera, until it is told to stop.
 
 use super::{Appliance, ImportBoard, Progress, Watchdog, log};
-use crate::config::store::{ImportRecord, Store};
 use crate::config::{Can, Site};
 use crate::error::{Error, Result};
 use crate::event::ParcelRecord;
 use crate::plc::interface;
 use crate::plc::registers::ImportStatus;
 use crate::source::{Live, open_camera};
+use crate::store::{ImportRecord, Store};
 use serde::Serialize;
 use signal_hook::consts::{SIGINT, SIGTERM};
 use std::path::{Path, PathBuf};
@@ -39,7 +39,10 @@ pub fn run(options: &Options<'_>) -> Result<()> {
             .map_err(|e| Error::failure(format!("cannot wait for signals: {e}")))?;
     }
     let store = Store::new(options.store);
-    let mut site = Site::load(options.config.unwrap_or(&store.config()))?;
+    if options.config.is_none() {
+        store.settle();
+    }
+    let mut site = options.config.map_or_else(|| store.site(), Site::load)?;
     if options.config.is_none() {
         site.config.plc.state_file.get_or_insert_with(|| store.plc_state());
     }

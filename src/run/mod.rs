@@ -11,6 +11,7 @@ pub mod live;
 pub mod log;
 mod memory;
 pub mod offline;
+pub mod outputs;
 pub mod privileges;
 mod realtime;
 mod report;

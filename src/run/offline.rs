@@ -1,5 +1,6 @@
 //! `beltgauge measure`: a replay through the pipeline, as fast as it goes.
 
+use super::outputs::refuse_inputs;
 use super::{Annotator, memory};
 use crate::config::Site;
 use crate::error::{Error, Result};
@@ -26,7 +27,17 @@ pub trait Observer {
     fn record(&mut self, record: &ParcelRecord);
 }
 
-/// Measure a replay. After a broken input what was measured until there is written, with the
+impl Outputs<'_> {
+    /// Refuse outputs that would overwrite what is read: the recording, the configuration, the camera.
+    pub fn refuse_inputs(&self, inputs: &[&Path]) -> Result<()> {
+        for (option, output) in [("--jsonl", self.jsonl), ("--annotate", self.annotate)] {
+            output.map_or(Ok(()), |output| refuse_inputs(option, output, inputs))?;
+        }
+        Ok(())
+    }
+}
+
+/// Measure a replay. Pictures that could not be written are an error at the end. After a broken input what was measured until there is written, with the
 /// parcels still inside flagged unfinished, and the error returned.
 pub fn measure(
     mut source: Box<dyn FrameSource>,
@@ -68,10 +79,12 @@ pub fn measure(
             observer.record(record);
         }
         if let Some(annotator) = &mut annotator {
-            annotator.frame(&frame, last_index, &pipeline, &records)?;
+            annotator.frame(&frame, last_index, &pipeline, &records);
         }
         if let Some(result) = ended {
-            return result.map(|_| pipeline.counters());
+            result?;
+            annotator.map_or(Ok(()), Annotator::finish)?;
+            return Ok(pipeline.counters());
         }
     }
 }
