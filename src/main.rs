@@ -10,7 +10,7 @@ use beltgauge::run::budget::{self, StraightDown};
 use beltgauge::run::calibrate::{self, DataSheet};
 use beltgauge::run::offline::{self, Observer, Outputs};
 use beltgauge::run::{demo, import, live, privileges, update};
-use beltgauge::{run, source};
+use beltgauge::{run, sandbox, source};
 use clap::{Parser, Subcommand};
 use std::io::{IsTerminal, Write};
 use std::net::SocketAddr;
@@ -127,6 +127,9 @@ enum Command {
         #[arg(long, default_value = "/boot/EFI/Linux")]
         to: PathBuf,
     },
+    /// What this program starts as its own child, to parse what strangers bring.
+    #[command(name = sandbox::SUBCOMMAND, hide = true)]
+    Sandbox { task: String },
 }
 
 /// Where an appliance keeps its configurations.
@@ -279,7 +282,12 @@ fn main() -> ExitCode {
 /// Logs go beside the results, on standard error: `RUST_LOG=beltgauge=debug` shows more.
 fn start_log(cli: &Cli) {
     // An appliance's log is all that it leaves; a tool's results speak for themselves.
-    let level = if matches!(cli.command, Command::Run { .. }) { Level::INFO } else { Level::WARN };
+    let level = match cli.command {
+        Command::Run { .. } => Level::INFO,
+        // Its standard error says how it ended.
+        Command::Sandbox { .. } => return,
+        _ => Level::WARN,
+    };
     let filter = EnvFilter::builder().with_default_directive(level.into()).from_env_lossy();
     let log = tracing_subscriber::fmt().with_env_filter(filter).with_writer(std::io::stderr);
     match cli.log {
@@ -348,6 +356,7 @@ fn dispatch(command: Command) -> Result<()> {
             let report = update::update(&dir, &Store::new(&store), &to)?;
             print(format_args!("{}", report.trim_end()))
         }
+        Command::Sandbox { task } => source::serve_sandboxed(&task),
         Command::Check { config, store } => {
             let site = Site::load(&config.unwrap_or_else(|| Store::new(&store).config()))?;
             let plan = run::plan(&site);
