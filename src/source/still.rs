@@ -136,7 +136,7 @@ pub fn serve() -> Result<()> {
         .map_err(unreadable)
 }
 
-/// The image files of a folder, in order of name.
+/// The image files of a folder, in order of name; numbers in names count as numbers.
 pub fn stills_in(folder: &Path) -> Result<Vec<PathBuf>> {
     let unreadable = |e: std::io::Error| {
         Error::failure(format!("cannot list the directory: {e}")).in_file(folder)
@@ -155,6 +155,69 @@ pub fn stills_in(folder: &Path) -> Result<Vec<PathBuf>> {
             .in_file(folder)
             .allowed(EXTENSIONS.map(|e| format!("*.{e}")).join(", ")));
     }
-    files.sort();
+    files.sort_by_cached_key(|path| natural_order(path));
+    let same = |pair: &&[PathBuf]| natural_order(&pair[0]) == natural_order(&pair[1]);
+    if let Some([a, b]) = files.windows(2).find(same) {
+        let name =
+            |path: &Path| path.file_name().unwrap_or_default().to_string_lossy().into_owned();
+        let names = [name(a), name(b)];
+        return Err(Error::configuration(format!(
+            "{} and {} have the same number: which comes first is not known",
+            names[0], names[1]
+        ))
+        .in_file(folder)
+        .remedy("remove one, or number the files with the same count of digits"));
+    }
     Ok(files)
+}
+
+/// A piece of a file's name. Numbers compare by their count of digits, then by the digits.
+#[derive(Clone, Debug, PartialEq, Eq, PartialOrd, Ord)]
+enum Piece {
+    Number(usize, String),
+    Text(String),
+}
+
+/// A name in pieces: frame 2 comes before frame 10.
+fn natural_order(path: &Path) -> Vec<Piece> {
+    let name = path.file_name().unwrap_or_default().to_string_lossy();
+    let mut pieces: Vec<Piece> = Vec::new();
+    for run in name.as_bytes().chunk_by(|a, b| a.is_ascii_digit() == b.is_ascii_digit()) {
+        let text = String::from_utf8_lossy(run).into_owned();
+        let is_fraction =
+            matches!(&pieces[..], [.., Piece::Number(..), Piece::Text(t)] if t == ".");
+        pieces.push(if run[0].is_ascii_digit() && !is_fraction {
+            let digits = text.trim_start_matches('0').to_owned();
+            Piece::Number(digits.len(), digits)
+        } else {
+            Piece::Text(text)
+        });
+    }
+    pieces
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn frames_are_in_order_of_their_numbers() {
+        let in_order = [
+            "1.png",
+            "2.png",
+            "10.png",
+            "123456789012345678901234567890.png",
+            "cam2_frame9.png",
+            "cam2_frame10.png",
+            "cam10_frame1.png",
+            // Seconds with a fraction.
+            "t7.25.png",
+            "t7.5.png",
+            "t10.125.png",
+        ];
+        let keys = in_order.map(|name| natural_order(Path::new(name)));
+        assert!(keys.is_sorted_by(|a, b| a < b), "{keys:?}");
+        let same = ["07.png", "7.png"].map(|name| natural_order(Path::new(name)));
+        assert_eq!(same[0], same[1]);
+    }
 }
