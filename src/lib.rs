@@ -13,6 +13,7 @@
 //! - [`plan`]: all memory of the vision path, named and reasoned, in one mapping.
 //! - [`kernel`]: pixel loops on slices, a readable one and one in vectors. [`stage`]: the steps that own state.
 //! - [`belt`]: where the belt is. [`pipeline`]: the steps in order. [`event`]: what comes out.
+//! - [`sandbox`]: child processes for what strangers bring.
 //! - [`source`]: where frames come from. [`plc`]: how records reach the PLC.
 //! - [`store`]: the appliance's disk: configurations in force, sticks, whom it trusts.
 //! - [`run`]: threads and rings; the only room that knows source, pipeline, plc and store.
@@ -34,6 +35,7 @@ pub mod pipeline;
 pub mod plan;
 pub mod plc;
 pub mod run;
+pub mod sandbox;
 pub mod source;
 pub mod stage;
 pub mod store;

@@ -11,7 +11,7 @@ use beltgauge::run::offline::{self, Observer, Outputs};
 use beltgauge::run::outputs::refuse_inputs;
 use beltgauge::run::{demo, import, live, log, privileges, update};
 use beltgauge::store::{Store, manifest};
-use beltgauge::{run, source};
+use beltgauge::{run, sandbox, source};
 use clap::{Parser, Subcommand};
 use std::io::{IsTerminal, Write};
 use std::net::SocketAddr;
@@ -128,6 +128,9 @@ enum Command {
         #[arg(long, default_value = "/boot/EFI/Linux")]
         to: PathBuf,
     },
+    /// What this program starts as its own child, to parse what strangers bring.
+    #[command(name = sandbox::SUBCOMMAND, hide = true)]
+    Sandbox { task: String },
 }
 
 /// Where an appliance keeps its configurations.
@@ -269,7 +272,9 @@ fn main() -> ExitCode {
     let is_appliance = matches!(cli.command, Command::Run { .. } | Command::Demo { .. });
     // An appliance's log is all that it leaves; a tool's results speak for themselves.
     let level = if matches!(cli.command, Command::Run { .. }) { Level::INFO } else { Level::WARN };
-    let log = log::start(level, cli.log);
+    // A sandbox's standard error says how it ended.
+    let is_sandbox = matches!(cli.command, Command::Sandbox { .. });
+    let log = (!is_sandbox).then(|| log::start(level, cli.log));
     if is_appliance {
         run::end_on_panic();
     }
@@ -352,6 +357,7 @@ fn dispatch(command: Command) -> Result<()> {
             let report = update::update(&dir, &Store::new(&store), &to)?;
             print(format_args!("{}", report.trim_end()))
         }
+        Command::Sandbox { task } => source::serve_sandboxed(&task),
         Command::Check { config, store } => {
             let site = match config {
                 Some(config) => Site::load(&config),

@@ -200,6 +200,10 @@ fn a_stream_that_is_no_y4m_says_how_to_make_one() {
     measure_y4m("deep", b"YUV4MPEG2 W320 H240 F30:1 Cmono16\n", 2, &["Cmono16", "8-bit mono"]);
     measure_y4m("slow", b"YUV4MPEG2 W320 H240 F1:1000000 Cmono\n", 2, &["frame rate F", "--fps"]);
     measure_y4m("zero_rate", b"YUV4MPEG2 W320 H240 F0:0 Cmono\n", 2, &["frame rate F"]);
+    for field in ["t", "b", "m"] {
+        let header = format!("YUV4MPEG2 W320 H240 F30:1 I{field} Cmono\n");
+        measure_y4m("interlaced", header.as_bytes(), 2, &["interlaced", "-vf yadif"]);
+    }
     measure_y4m("long", &[b'Y'; 5000], 2, &["header is too long"]);
     measure_y4m("huge", b"YUV4MPEG2 W99999999999999999999 H240 F30:1 Cmono\n", 2, &["width W"]);
 }
@@ -280,6 +284,38 @@ fn a_directory_needs_a_frame_rate_and_frames() {
         &["measure".as_ref(), &empty, "--config".as_ref(), &config, flag, thirty],
         2,
         &["no frames"],
+    );
+}
+
+#[test]
+fn a_lens_that_cannot_be_is_refused() {
+    for focal_px in ["8", "340"] {
+        let what = format!(
+            "budget --camera-height-mm 1500 --focal-px {focal_px} --image 1920x1200 \
+             --zone-mm 1200x760 --speed-mm-per-s 500 --fps 40"
+        );
+        let arguments: Vec<&Path> = what.split_whitespace().map(Path::new).collect();
+        refused(&arguments, 2, &[&format!("--focal-px {focal_px}"), "346 to", "remedy"]);
+    }
+}
+
+#[test]
+fn two_frames_of_one_number_are_refused() {
+    let (folder, config) = directory("one_number");
+    for name in ["7.pgm", "07.pgm"] {
+        write_pgm(&folder.join(name), SIZE);
+    }
+    refused(
+        &[
+            "measure".as_ref(),
+            &folder,
+            "--fps".as_ref(),
+            "30".as_ref(),
+            "--config".as_ref(),
+            &config,
+        ],
+        2,
+        &["7.pgm", "07.pgm", "same number", "remedy"],
     );
 }
 

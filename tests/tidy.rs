@@ -22,7 +22,8 @@ const MAY_USE: &[(&str, &[&str])] = &[
             "error",
         ],
     ),
-    ("source", &["camera", "config", "plan", "image", "units", "error"]),
+    ("sandbox", &["error"]),
+    ("source", &["camera", "config", "plan", "sandbox", "image", "units", "error"]),
     ("plc", &["config", "event", "error"]),
     ("store", &["camera", "config", "error"]),
 ];

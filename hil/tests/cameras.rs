@@ -3,9 +3,11 @@
 
 use beltgauge::config::{CameraTable, Interface};
 use beltgauge::plan::Block;
+use beltgauge::sandbox;
 use beltgauge::source::{Arrival, Driver, Feed, Live, Next, open_camera};
 use hil::allocations;
 use std::process::{Child, Command, Stdio};
+use std::sync::Once;
 use std::time::{Duration, Instant};
 
 const SIZE: [usize; 2] = [512, 384];
@@ -49,6 +51,8 @@ fn interfaces() -> Vec<(Interface, &'static str)> {
 }
 
 fn settings(interface: Interface, device: &str) -> CameraTable {
+    static PROGRAM: Once = Once::new();
+    PROGRAM.call_once(|| sandbox::use_program(hil::beltgauge()));
     let mut settings = CameraTable::new("camera.toml".into());
     settings.interface = interface;
     settings.device = Some(device.to_owned());

@@ -3,7 +3,7 @@
 use super::report;
 use crate::camera::{Camera, Lens, LensModel};
 use crate::config::{Config, Site};
-use crate::error::Result;
+use crate::error::{Error, Result};
 use crate::stage::measure::budget::{Geometry, expected_sigma_mm};
 use nalgebra::{Matrix3, Vector3};
 use std::fmt::Write as _;
@@ -41,12 +41,25 @@ pub struct StraightDown {
     pub speed_mm_per_s: f64,
 }
 
+/// Focal lengths of lenses, as part of the image's longer side: 140 and 3 degrees of view.
+const FOCAL_PER_SIDE: [f64; 2] = [0.18, 20.0];
+
 impl StraightDown {
     /// The site it makes.
     ///
     /// # Errors
     /// When the camera does not see the zone, or a value is out of its range.
     pub fn site(&self) -> Result<Site> {
+        let width = self.image_size_px[0].max(self.image_size_px[1]) as f64;
+        let [shortest, longest] = FOCAL_PER_SIDE.map(|part| part * width);
+        if !(shortest..=longest).contains(&self.focal_px) {
+            return Err(Error::configuration(format!("--focal-px {}", self.focal_px))
+                .allowed(format!(
+                    "{shortest:.0} to {longest:.0} px for images of {width} px: lenses without \
+                     distortion see 3 to 140 degrees"
+                ))
+                .remedy("divide the focal length in mm by the size of a pixel in mm"));
+        }
         let [x, y] = self.zone_mm.map(|side| 0.5 * side);
         let config = Config::parse(&format!(
             "[camera]\ncalibration = \"none\"\n[belt]\nspeed_mm_per_s = {}\n\

@@ -183,8 +183,9 @@ fn look(
     let mut shots: Vec<Shot> = Vec::with_capacity(files.len());
     for (number, path) in files.iter().enumerate() {
         let expected = size_px.or(shots.first().map(|s| s.still.size_px));
-        check_size(path, Still::size_of(path)?, expected)?;
-        let still = Still::load(path)?;
+        // They may come from a stranger's stick.
+        let still = Still::load_sandboxed(path)?;
+        check_size(path, still.size_px, expected)?;
         let plane =
             still.plane().ok_or_else(|| Error::failure("an image without pixels").in_file(path))?;
         let found = board.find(plane);
@@ -279,7 +280,7 @@ fn belt_summary(table: &BeltTable) -> String {
     )
 }
 
-/// Before an image is decoded: its size must be possible, and that of the others or the lens.
+/// The size of an image must be possible, and that of the others or the lens.
 fn check_size(path: &Path, size_px: [usize; 2], expected: Option<[usize; 2]>) -> Result<()> {
     let [width, height] = size_px;
     let wrong = || Error::configuration(format!("an image of {width} x {height} px")).in_file(path);

@@ -1,4 +1,4 @@
-//! A directory of image files, in order of name.
+//! A directory of image files, in order of name, numbers as numbers.
 
 use super::{FrameSource, Still, stills_in};
 use crate::error::{Error, Result};

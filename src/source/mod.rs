@@ -41,6 +41,15 @@ pub trait FrameSource: Send {
     fn skip(&mut self, _count: u64) {}
 }
 
+/// In a child process of [`crate::sandbox`]: carry out its task.
+pub fn serve_sandboxed(task: &str) -> Result<()> {
+    match task {
+        gige::features::TASK => gige::features::serve(),
+        still::TASK => still::serve(),
+        _ => Err(Error::configuration(format!("no task {task:?}"))),
+    }
+}
+
 /// Open the camera of a configuration for frames of a size.
 pub fn open_camera(settings: &CameraTable, size_px: [usize; 2]) -> Result<Box<dyn Driver>> {
     match settings.interface {

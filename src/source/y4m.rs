@@ -50,6 +50,15 @@ impl Y4m {
                 "H" => height = value.parse::<usize>().ok(),
                 "F" => rate = parse_rate(value),
                 "C" => value.clone_into(&mut chroma),
+                "I" if ["t", "b", "m"].contains(&value) => {
+                    return Err(wrong(format!(
+                        "the stream is interlaced, I{value}: each frame is two pictures of \
+                         different times, row by row"
+                    ))
+                    .remedy(
+                        "ffmpeg -i INPUT -vf yadif=1 -pix_fmt gray -f yuv4mpegpipe -strict -1 -",
+                    ));
+                }
                 _ => {}
             }
         }

@@ -3,6 +3,9 @@
 //! A block (frame) is a leader (packet 0), payload packets 1 to n and a trailer (n + 1), of GigE
 //! cameras' stream protocol. Two blocks may be under way, as the packets that were asked for again
 //! come after those of the next block.
+//!
+//! Where the stream is, whole images say: a packet alone may be a stranger's, and its block's number
+//! any. It costs a slot until it is given up, no more.
 
 use crate::error::{Error, Result};
 use crate::plan::Block;
@@ -22,6 +25,12 @@ pub const RANGES: usize = 16;
 const GIVE_UP: Duration = Duration::from_millis(100);
 /// Blocks under way.
 const SLOTS: usize = 2;
+/// Blocks that are whole or given up, of which late packets are ignored.
+const ENDED: usize = 8;
+/// A camera whose block numbers jump by more began to count anew.
+const BLOCKS_LOST_MAX: i64 = 100_000;
+/// So many leaders of another size in turn are no strangers': the camera was set up otherwise.
+const OTHER_SIZE_MAX: u32 = 3;
 /// The status of a packet that cannot be sent again has this bit.
 const STATUS_ERROR: u16 = 0x8000;
 
@@ -58,7 +67,7 @@ pub struct Resend {
 
 impl Resend {
     /// `PACKETRESEND_CMD`: key, flags, command, length, request id; channel, block, first, last.
-    fn new(block_id: u64, [first, last]: [u32; 2], extended: bool) -> Self {
+    fn new(BlockId { id: block_id, extended }: BlockId, [first, last]: [u32; 2]) -> Self {
         let mut request = Self { bytes: [0; 28], len: 0 };
         let (flags, length) = if extended { (0x10, 20u16) } else { (0, 12) };
         request.put(&[0x42, flags, 0x00, 0x40]);
@@ -86,13 +95,40 @@ impl Resend {
     }
 }
 
+/// A block's number, and whether it has 64 bits.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+struct BlockId {
+    id: u64,
+    extended: bool,
+}
+
+impl BlockId {
+    fn of(header: &GvspHeader) -> Self {
+        Self { id: header.block_id, extended: header.extended_ids }
+    }
+
+    /// How many blocks after `other` this is; numbers of 16 bits go from 65535 to 1. `None` when
+    /// they were not counted together.
+    fn ahead(self, other: Self) -> Option<i64> {
+        if self.extended != other.extended {
+            return None;
+        }
+        let ahead = if self.extended {
+            self.id.wrapping_sub(other.id) as i64
+        } else {
+            let ahead = (self.id as i64 - other.id as i64).rem_euclid(65_535);
+            if ahead > 32_767 { ahead - 65_535 } else { ahead }
+        };
+        (-(SLOTS as i64)..=BLOCKS_LOST_MAX).contains(&ahead).then_some(ahead)
+    }
+}
+
 struct Slot {
     image: Block<u8>,
     /// Leader and payload packets that came.
     came: PacketBitmap,
     /// The block that is under way here.
-    block: Option<u64>,
-    extended: bool,
+    block: Option<BlockId>,
     /// Bytes of the image in a packet, which are fewer behind a header with long numbers.
     payload: usize,
     /// Leader and payload packets of the block.
@@ -110,8 +146,12 @@ pub struct Assembly {
     image_bytes: usize,
     datagram_bytes: usize,
     size_px: [usize; 2],
-    /// The newest block begun, its number, and whether blocks have 64 bits.
-    newest: Option<(u64, u64)>,
+    /// The newest whole block, and the number of its frame.
+    newest: Option<(BlockId, u64)>,
+    /// The last blocks that ended, whole or not.
+    ended: heapless::HistoryBuf<BlockId, ENDED>,
+    /// Leaders of another size in turn.
+    other_size: u32,
     resends: u64,
 }
 
@@ -126,7 +166,6 @@ impl Assembly {
                 image: Block::own(image_bytes)?,
                 came: PacketBitmap::new(packets_max),
                 block: None,
-                extended: false,
                 payload: 1,
                 packets: 0,
                 stamp: 0,
@@ -141,6 +180,8 @@ impl Assembly {
             datagram_bytes,
             size_px,
             newest: None,
+            ended: heapless::HistoryBuf::new(),
+            other_size: 0,
             resends: 0,
         })
     }
@@ -160,9 +201,10 @@ impl Assembly {
         let Ok(header) = parse_header(datagram) else { return Ok(Step::More) };
         if header.status & STATUS_ERROR != 0 {
             // It cannot be had any more.
-            let slot = self.slots.iter_mut().find(|slot| slot.block == Some(header.block_id));
-            return Ok(slot.map_or(Step::More, |slot| {
-                slot.block = None;
+            let block = Some(BlockId::of(&header));
+            let index = self.slots.iter().position(|slot| slot.block == block);
+            return Ok(index.map_or(Step::More, |index| {
+                self.end(index);
                 Step::Torn
             }));
         }
@@ -174,6 +216,11 @@ impl Assembly {
             GvspContent::Leader(leader) => {
                 let image = leader.image.map(|image| [image.width as usize, image.height as usize]);
                 if image != Some(self.size_px) {
+                    self.other_size += 1;
+                    if self.other_size < OTHER_SIZE_MAX {
+                        self.end(index);
+                        return Ok(Step::Torn);
+                    }
                     let [width, height] = image.unwrap_or_default();
                     let [w, h] = self.size_px;
                     return Err(Error::configuration(format!(
@@ -181,6 +228,7 @@ impl Assembly {
                     ))
                     .remedy("check the camera's region of interest and binning"));
                 }
+                self.other_size = 0;
                 slot.stamp = leader.timestamp;
                 slot.came.set(0);
             }
@@ -195,10 +243,9 @@ impl Assembly {
             GvspContent::Trailer(_) | GvspContent::Unsupported { .. } | _ => {}
         }
         if slot.came.received() == slot.packets {
-            let sequence = self.sequence_of(header.block_id, header.extended_ids);
-            let slot = &mut self.slots[index];
-            slot.block = None;
             let (stamp, began) = (slot.stamp, slot.began);
+            let sequence = self.sequence_of(BlockId::of(&header));
+            self.end(index);
             return Ok(Step::Whole(Image { slot: index, sequence, stamp, began }));
         }
         Ok(if torn { Step::Torn } else { Step::More })
@@ -206,36 +253,52 @@ impl Assembly {
 
     /// The slot of a packet's block, and whether another block had to go for it.
     fn slot_of(&mut self, header: &GvspHeader, now: Instant) -> Option<(usize, bool)> {
-        let id = header.block_id;
-        if let Some(index) = self.slots.iter().position(|slot| slot.block == Some(id)) {
+        let block = BlockId::of(header);
+        if let Some(index) = self.slots.iter().position(|slot| slot.block == Some(block)) {
             return Some((index, false));
         }
-        let ahead = self.newest.map_or(1, |(newest, _)| ahead(id, newest, header.extended_ids));
-        if ahead <= 0 {
+        if self.ended.contains(&block) {
             // Too late: it is whole or given up.
             return None;
         }
-        let sequence = self.newest.map_or(0, |(_, number)| number.saturating_add(ahead as u64));
-        self.newest = Some((id, sequence));
         let free = self.slots.iter().position(|slot| slot.block.is_none());
         let index = free.unwrap_or_else(|| usize::from(self.slots[1].began < self.slots[0].began));
+        self.end(index);
         let slot = &mut self.slots[index];
         slot.payload = self.datagram_bytes.saturating_sub(header.header_len).max(1);
         slot.packets = 1 + self.image_bytes.div_ceil(slot.payload);
         slot.came.reset(slot.packets);
-        (slot.block, slot.extended, slot.rounds) = (Some(id), header.extended_ids, 0);
+        (slot.block, slot.rounds) = (Some(block), 0);
         (slot.began, slot.touched) = (now, now);
         Some((index, free.is_none()))
     }
 
-    fn sequence_of(&self, id: u64, extended: bool) -> u64 {
-        let (newest, number) = self.newest.unwrap_or((id, 0));
-        number.saturating_add_signed(ahead(id, newest, extended))
+    /// The block in a slot is whole or given up.
+    fn end(&mut self, index: usize) {
+        if let Some(block) = self.slots[index].block.take() {
+            self.ended.write(block);
+        }
+    }
+
+    /// The number of a whole block's frame. After a jump that cannot be, counting goes on from
+    /// where it was.
+    fn sequence_of(&mut self, block: BlockId) -> u64 {
+        let Some((newest, number)) = self.newest else {
+            self.newest = Some((block, 0));
+            return 0;
+        };
+        let ahead = block.ahead(newest).unwrap_or(1);
+        let sequence = number.saturating_add_signed(ahead);
+        if ahead > 0 {
+            self.newest = Some((block, sequence));
+        }
+        sequence
     }
 
     /// Nothing has come just now: ask again for what is missing, or give it up.
     pub fn idle(&mut self, now: Instant, resends: &mut heapless::Vec<Resend, RANGES>) -> Step {
-        for slot in &mut self.slots {
+        for index in 0..SLOTS {
+            let slot = &mut self.slots[index];
             let Some(block) = slot.block else { continue };
             let quiet = now.saturating_duration_since(slot.touched);
             if quiet < PATIENCE {
@@ -243,7 +306,7 @@ impl Assembly {
             }
             if slot.rounds >= ROUNDS {
                 if quiet >= GIVE_UP / 2 {
-                    slot.block = None;
+                    self.end(index);
                     return Step::Torn;
                 }
                 continue;
@@ -253,7 +316,7 @@ impl Assembly {
             let mut from = 0;
             while let Some([first, last]) = missing(&slot.came, slot.packets, from) {
                 from = last as usize + 1;
-                if resends.push(Resend::new(block, [first, last], slot.extended)).is_err() {
+                if resends.push(Resend::new(block, [first, last])).is_err() {
                     break;
                 }
                 self.resends += u64::from(last - first + 1);
@@ -261,15 +324,6 @@ impl Assembly {
         }
         Step::More
     }
-}
-
-/// How many blocks after `newest` a block is; numbers of 16 bits go from 65535 to 1.
-fn ahead(id: u64, newest: u64, extended: bool) -> i64 {
-    if extended {
-        return id.wrapping_sub(newest) as i64;
-    }
-    let ahead = (id as i64 - newest as i64).rem_euclid(65_535);
-    if ahead > 32_767 { ahead - 65_535 } else { ahead }
 }
 
 /// The first run of missing packets from `from` on.
@@ -315,7 +369,7 @@ mod tests {
         match format {
             1 => {
                 bytes.extend([0, 0, 0, 1]);
-                bytes.extend((1000 * block).to_be_bytes());
+                bytes.extend(1000u64.wrapping_mul(block).to_be_bytes());
                 bytes.extend(0x0108_0001u32.to_be_bytes());
                 bytes.extend((SIZE[0] as u32).to_be_bytes());
                 bytes.extend((SIZE[1] as u32).to_be_bytes());
@@ -434,10 +488,66 @@ mod tests {
     }
 
     #[test]
+    fn a_stray_packet_of_any_block_costs_three_blocks_at_most() {
+        // Numbers of the stream's first block; 16 bits wrap around within it, 64 bits as well.
+        let streams = [(1, false), (65_530, false), (500, true), (u64::MAX - 5, true)];
+        let strays = [1, 2, 3, 100, 20_000, 32_767, 32_768, 40_000, 65_000, 1 << 40, 1 << 63];
+        for ((first, extended), stray) in streams.into_iter().flat_map(|s| strays.map(|t| (s, t))) {
+            for stray_extended in [extended, !extended] {
+                let (mut assembly, mut now) = (assembly(), Instant::now());
+                let last = if extended { EXTENDED_PACKETS } else { PACKETS };
+                let (mut block, mut whole) = (first, Vec::new());
+                for frame in 0..12 {
+                    if frame == 4 {
+                        let block = first.wrapping_add(stray);
+                        let stray = packet(block, 7, stray_extended);
+                        let _ = assembly.packet(&stray, now).expect("ignored");
+                    }
+                    let packets: Vec<_> =
+                        (0..=last).map(|id| packet(block, id, extended)).collect();
+                    let steps = feed(&mut assembly, &packets, now);
+                    whole.extend(steps.iter().filter_map(|step| match step {
+                        Step::Whole(image) => Some((frame, image.sequence)),
+                        _ => None,
+                    }));
+                    // What is missing is not asked for: the line is busy.
+                    now += Duration::from_millis(25);
+                    block = if extended { block.wrapping_add(1) } else { block % 65_535 + 1 };
+                }
+                let what = format!("from {first}, stray {stray}, {stray_extended}: {whole:?}");
+                assert!(whole.is_sorted_by(|a, b| a.1 < b.1), "{what}");
+                let after = whole.iter().filter(|(frame, _)| *frame >= 7).count();
+                assert_eq!(after, 5, "{what}");
+                assert!(whole.len() >= 11, "{what}");
+            }
+        }
+    }
+
+    #[test]
+    fn a_camera_that_counts_anew_is_followed() {
+        let (mut assembly, now) = (assembly(), Instant::now());
+        let mut numbers = Vec::new();
+        for block in [30_000, 30_001, 1, 2, 3, 60_000, 60_001] {
+            let packets: Vec<_> = (0..=PACKETS).map(|id| packet(block, id, false)).collect();
+            match feed(&mut assembly, &packets, now)[..] {
+                [Step::Whole(whole)] => numbers.push(whole.sequence),
+                ref steps => panic!("{steps:?}"),
+            }
+        }
+        assert_eq!(numbers, [0, 1, 2, 3, 4, 5, 6]);
+    }
+
+    #[test]
     fn another_size_is_an_error_and_rubbish_is_ignored() {
         let (mut assembly, now) =
             (Assembly::new(3000, DATAGRAM, [50, 60]).expect("small"), Instant::now());
-        let error = assembly.packet(&packet(1, 0, false), now).expect_err("100 x 30").to_string();
+        for block in 1..OTHER_SIZE_MAX {
+            let step = assembly.packet(&packet(u64::from(block), 0, false), now);
+            assert_eq!(step.expect("may be a stranger's"), Step::Torn);
+        }
+        let block = u64::from(OTHER_SIZE_MAX);
+        let error = assembly.packet(&packet(block, 0, false), now).expect_err("100 x 30");
+        let error = error.to_string();
         assert!(error.contains("100 x 30 px, asked for were 50 x 60 px"), "{error}");
         let mut bytes: Vec<u8> = Vec::new();
         for i in 0..20_000u32 {

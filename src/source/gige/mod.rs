@@ -1,10 +1,12 @@
 //! GigE cameras, by this program's own receiver: the capture thread itself takes the packets.
 //!
-//! Control channel, features and packet formats are the `viva-genicam` crate's; frames are put
-//! together in `assembly`, which asks again for packets that are missing. After opening, nothing
-//! is allocated for a frame.
+//! Control channel and packet formats are the `viva-genicam` crate's; its features too, but in a
+//! child process (`features`). Frames are put together in `assembly`, which asks again for packets
+//! that are missing. After opening, nothing is allocated for a frame.
 
 mod assembly;
+mod control;
+pub mod features;
 
 use super::feed::{Arrival, Driver};
 use super::pixels::{PixelFormat, by_genicam};
@@ -12,13 +14,14 @@ use crate::config::CameraTable;
 use crate::error::{Error, Result};
 use crate::plan::Block;
 use assembly::{Assembly, Resend, Step};
+use control::{Control, stream_register};
+use features::Features;
 use std::net::{Ipv4Addr, UdpSocket};
 use std::time::{Duration, Instant};
-use viva_genicam::genapi::RegisterIo;
+use viva_genicam::blocking;
 use viva_genicam::gige::{
     DeviceInfo, DiscoveryOptions, GVCP_PORT, consts, set_recv_buffer, wait_readable,
 };
-use viva_genicam::{Camera, ControlState, GigeRegisterIo, blocking};
 
 /// How long discovery listens.
 const DISCOVERY: Duration = Duration::from_millis(500);
@@ -37,7 +40,8 @@ const SILENCE: Duration = Duration::from_secs(1);
 
 /// A camera that streams to us.
 pub struct Gige {
-    camera: Camera<GigeRegisterIo>,
+    features: Features,
+    control: Control,
     address: Ipv4Addr,
     socket: UdpSocket,
     datagram: Vec<u8>,
@@ -59,19 +63,19 @@ impl Gige {
         let (format, _) = by_genicam(settings.format.as_deref().unwrap_or("Mono8"))?;
         let found = find(settings.device.as_deref())?;
         let place = found.ip;
-        let camera = blocking::connect(&found)
-            .map_err(|e| failed("cannot control the camera", e).at(place))?;
-        Self::start(camera, place, settings, format, size_px).map_err(|e| e.at(place))
+        let control = Control::take(place)?;
+        Self::start(control, place, settings, format, size_px).map_err(|e| e.at(place))
     }
 
     fn start(
-        mut camera: Camera<GigeRegisterIo>,
+        control: Control,
         address: Ipv4Addr,
         settings: &CameraTable,
         format: PixelFormat,
         size_px: [usize; 2],
     ) -> Result<Self> {
-        set_features(&mut camera, settings, size_px)?;
+        let mut features = Features::of(control.registers())?;
+        set_features(&mut features, &control, settings, size_px)?;
         let network = |e: std::io::Error| failed("cannot open a socket for the pictures", e);
         // The address by which the camera reaches us is that by which we reach it.
         let towards = UdpSocket::bind((Ipv4Addr::UNSPECIFIED, 0)).map_err(network)?;
@@ -90,10 +94,9 @@ impl Gige {
             );
         }
         let port = socket.local_addr().map_err(network)?.port();
-        let packet_bytes = direct_stream(&camera, ours, port, settings)?;
-        let ticks = camera.transport();
+        let packet_bytes = direct_stream(&control, ours, port, settings)?;
         let ticks = [consts::TIMESTAMP_TICK_FREQUENCY_HIGH, consts::TIMESTAMP_TICK_FREQUENCY_LOW]
-            .map(|register| read(ticks, register).unwrap_or(0));
+            .map(|register| control.read(register).unwrap_or(0));
         let ticks_per_s = match u64::from(ticks[0]) << 32 | u64::from(ticks[1]) {
             0 => 1e9,
             ticks => ticks as f64,
@@ -102,11 +105,13 @@ impl Gige {
         let image_bytes = format.row_bytes(width) * height;
         let datagram_bytes = (packet_bytes - HEADERS) as usize;
         let assembly = Assembly::new(image_bytes, datagram_bytes, size_px)?;
-        camera.acquisition_start().map_err(|e| failed("cannot start the camera", e))?;
+        let started = features.start(control.registers())?;
+        started.map_err(|e| failed("cannot start the camera", e))?;
         let datagram = vec![0; packet_bytes as usize];
         let heard = Instant::now();
         Ok(Self {
-            camera,
+            features,
+            control,
             address,
             socket,
             datagram,
@@ -165,11 +170,7 @@ impl Gige {
             return Ok(());
         }
         self.heard = Instant::now();
-        match self.camera.transport().refresh_control_state() {
-            Ok(ControlState::Held) => Ok(()),
-            Ok(_) => Err(failed("the camera is lost", "another program has taken it")),
-            Err(e) => Err(failed("the camera is lost", e)),
-        }
+        self.control.check()
     }
 
     fn wait(&mut self) -> Result<Step> {
@@ -215,9 +216,9 @@ impl Driver for Gige {
 
 impl Drop for Gige {
     fn drop(&mut self) {
+        self.features.stop(self.control.registers());
         // A camera that is gone does not hear it.
-        let _ = self.camera.acquisition_stop();
-        let _ = write(self.camera.transport(), stream_register(consts::STREAM_DESTINATION_PORT), 0);
+        let _ = self.control.write(stream_register(consts::STREAM_DESTINATION_PORT), 0);
     }
 }
 
@@ -259,74 +260,72 @@ fn find(wanted: Option<&str>) -> Result<DeviceInfo> {
 }
 
 fn set_features(
-    camera: &mut Camera<GigeRegisterIo>,
+    features: &mut Features,
+    control: &Control,
     settings: &CameraTable,
     [width, height]: [usize; 2],
 ) -> Result<()> {
-    let mut set = |key: &str, name: &str, value: &str| {
-        camera.set(name, value).map_err(|e| {
+    // Outside: the child has ended; inside: the camera refuses.
+    let mut set = |key: &str, name: &str, value: &str| -> Result<Result<()>> {
+        let set = features.set(control.registers(), name, value)?;
+        Ok(set.map_err(|e| {
             Error::configuration(format!("{key}: the camera does not take {name} = {value}: {e}"))
                 .remedy("give what the camera's manual allows")
-        })
+        }))
     };
     let image_size = "image_size_px of the calibration";
-    set(image_size, "Width", &width.to_string())?;
-    set(image_size, "Height", &height.to_string())?;
-    set("camera.format", "PixelFormat", settings.format.as_deref().unwrap_or("Mono8"))?;
+    set(image_size, "Width", &width.to_string())??;
+    set(image_size, "Height", &height.to_string())??;
+    set("camera.format", "PixelFormat", settings.format.as_deref().unwrap_or("Mono8"))??;
     // Cameras without these have nothing to switch off.
-    let _ = set("", "AcquisitionMode", "Continuous");
+    let _ = set("", "AcquisitionMode", "Continuous")?;
     if let Some(us) = settings.exposure_us {
-        let _ = set("", "ExposureAuto", "Off");
-        set("camera.exposure_us", "ExposureTime", &us.to_string())
-            .or_else(|e| set("", "ExposureTimeAbs", &us.to_string()).map_err(|_| e))?;
+        let _ = set("", "ExposureAuto", "Off")?;
+        let us = us.to_string();
+        if let Err(e) = set("camera.exposure_us", "ExposureTime", &us)? {
+            set("", "ExposureTimeAbs", &us)?.map_err(|_| e)?;
+        }
     }
     if let Some(gain) = settings.gain {
-        let _ = set("", "GainAuto", "Off");
-        set("camera.gain", "Gain", &gain.to_string())
-            .or_else(|e| set("", "GainRaw", &gain.round().to_string()).map_err(|_| e))?;
+        let _ = set("", "GainAuto", "Off")?;
+        if let Err(e) = set("camera.gain", "Gain", &gain.to_string())? {
+            set("", "GainRaw", &gain.round().to_string())?.map_err(|_| e)?;
+        }
     }
     if let Some(fps) = settings.fps {
-        let _ = set("", "AcquisitionFrameRateEnable", "true");
-        set("camera.fps", "AcquisitionFrameRate", &fps.to_string())
-            .or_else(|e| set("", "AcquisitionFrameRateAbs", &fps.to_string()).map_err(|_| e))?;
+        let _ = set("", "AcquisitionFrameRateEnable", "true")?;
+        let fps = fps.to_string();
+        if let Err(e) = set("camera.fps", "AcquisitionFrameRate", &fps)? {
+            set("", "AcquisitionFrameRateAbs", &fps)?.map_err(|_| e)?;
+        }
     }
     for (name, value) in &settings.controls {
         let text = value.as_str().map_or_else(|| value.to_string(), ToOwned::to_owned);
-        set(&format!("camera.controls.{name}"), name, &text)?;
+        set(&format!("camera.controls.{name}"), name, &text)??;
     }
     Ok(())
 }
 
 /// Tell the camera where to send its pictures, and in packets of which size; returns the size.
 fn direct_stream(
-    camera: &Camera<GigeRegisterIo>,
+    control: &Control,
     ours: Ipv4Addr,
     port: u16,
     settings: &CameraTable,
 ) -> Result<u32> {
-    let io = camera.transport();
     let refused = |e: String| failed("the camera does not take the stream's address", e);
     let bytes = settings.packet_bytes.unwrap_or(PACKET_BYTES);
     let size = stream_register(consts::STREAM_PACKET_SIZE);
-    write(io, size, bytes | DO_NOT_FRAGMENT).map_err(refused)?;
-    let given = read(io, size).map_err(refused)? & 0xffff;
+    control.write(size, bytes | DO_NOT_FRAGMENT).map_err(refused)?;
+    let given = control.read(size).map_err(refused)? & 0xffff;
     if !(576..=9000).contains(&given) {
         return Err(failed("the camera's packets", format!("{given} bytes")));
     }
-    write(io, stream_register(consts::STREAM_DESTINATION_ADDRESS), ours.into()).map_err(refused)?;
-    write(io, stream_register(consts::STREAM_DESTINATION_PORT), port.into()).map_err(refused)?;
+    control
+        .write(stream_register(consts::STREAM_DESTINATION_ADDRESS), ours.into())
+        .map_err(refused)?;
+    control
+        .write(stream_register(consts::STREAM_DESTINATION_PORT), port.into())
+        .map_err(refused)?;
     Ok(given)
-}
-
-fn stream_register(offset: u64) -> u64 {
-    consts::STREAM_CHANNEL_BASE + offset
-}
-
-fn read(io: &GigeRegisterIo, register: u64) -> std::result::Result<u32, String> {
-    let bytes = io.read(register, 4).map_err(|e| e.to_string())?;
-    bytes.try_into().map(u32::from_be_bytes).map_err(|_| "a short answer".to_owned())
-}
-
-fn write(io: &GigeRegisterIo, register: u64, value: u32) -> std::result::Result<(), String> {
-    io.write(register, &value.to_be_bytes()).map_err(|e| e.to_string())
 }
