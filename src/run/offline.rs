@@ -24,6 +24,8 @@ pub trait Observer {
     fn frame(&mut self, _index: u64) {}
     /// A parcel was measured.
     fn record(&mut self, record: &ParcelRecord);
+    /// At the end: what makes the recording doubtful.
+    fn doubt(&mut self, _doubt: &str) {}
 }
 
 /// Measure a replay. After a broken input what was measured until there is written, with the
@@ -71,6 +73,9 @@ pub fn measure(
             annotator.frame(&frame, last_index, &pipeline, &records)?;
         }
         if let Some(result) = ended {
+            if let Some(doubt) = source.doubt() {
+                observer.doubt(&doubt);
+            }
             return result.map(|_| pipeline.counters());
         }
     }
