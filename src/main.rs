@@ -315,6 +315,10 @@ impl Observer for Console {
         // The record file goes on when nobody reads the table any more.
         let _ = writeln!(std::io::stdout(), "{record}");
     }
+
+    fn doubt(&mut self, doubt: &str) {
+        let _ = writeln!(std::io::stderr(), "warning: {doubt}");
+    }
 }
 
 fn dispatch(command: Command) -> Result<()> {

@@ -25,6 +25,8 @@ pub trait Observer {
     fn frame(&mut self, _index: u64) {}
     /// A parcel was measured.
     fn record(&mut self, record: &ParcelRecord);
+    /// At the end: what makes the recording doubtful.
+    fn doubt(&mut self, _doubt: &str) {}
 }
 
 impl Outputs<'_> {
@@ -37,8 +39,9 @@ impl Outputs<'_> {
     }
 }
 
-/// Measure a replay. Pictures that could not be written are an error at the end. After a broken input what was measured until there is written, with the
-/// parcels still inside flagged unfinished, and the error returned.
+/// Measure a replay. Pictures that could not be written are an error at the end. After a broken input
+/// what was measured until there is written, with the parcels still inside flagged unfinished, and the
+/// error returned.
 pub fn measure(
     mut source: Box<dyn FrameSource>,
     site: Site,
@@ -82,6 +85,9 @@ pub fn measure(
             annotator.frame(&frame, last_index, &pipeline, &records);
         }
         if let Some(result) = ended {
+            if let Some(doubt) = source.doubt() {
+                observer.doubt(&doubt);
+            }
             result?;
             annotator.map_or(Ok(()), Annotator::finish)?;
             return Ok(pipeline.counters());

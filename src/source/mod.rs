@@ -6,6 +6,7 @@ mod directory;
 mod feed;
 mod gige;
 mod pixels;
+mod repeats;
 mod still;
 pub mod synthetic;
 #[cfg(feature = "v4l2")]
@@ -20,6 +21,7 @@ pub use y4m::Y4m;
 use crate::config::{CameraTable, Interface};
 use crate::error::{Error, Result};
 use crate::image::FrameTime;
+use repeats::WithoutRepeats;
 use std::path::Path;
 
 /// Frame rates that make sense: slower, a parcel is hardly seen twice.
@@ -39,6 +41,11 @@ pub trait FrameSource: Send {
     /// The next `count` frames were not taken in time: leave them out. A camera does so by
     /// itself.
     fn skip(&mut self, _count: u64) {}
+
+    /// What makes a recording's frames doubtful, in plain words, once they have been read.
+    fn doubt(&self) -> Option<String> {
+        None
+    }
 }
 
 /// In a child process of [`crate::sandbox`]: carry out its task.
@@ -76,7 +83,8 @@ pub fn open(input: &Path, fps: Option<f64>) -> Result<Box<dyn FrameSource>> {
         )));
     }
     if input == Path::new("-") {
-        return Ok(Box::new(Y4m::new(Box::new(std::io::stdin()), "standard input", fps)?));
+        let y4m = Y4m::new(Box::new(std::io::stdin()), "standard input", fps)?;
+        return Ok(Box::new(WithoutRepeats::new(y4m)));
     }
     let metadata = std::fs::metadata(input).map_err(|e| {
         Error::configuration(format!("cannot open the input: {e}"))
@@ -84,9 +92,10 @@ pub fn open(input: &Path, fps: Option<f64>) -> Result<Box<dyn FrameSource>> {
             .remedy("give a Y4M file, `-` for standard input, or a directory of images")
     })?;
     if metadata.is_dir() {
-        return Ok(Box::new(Directory::open(input, fps)?));
+        return Ok(Box::new(WithoutRepeats::new(Directory::open(input, fps)?)));
     }
     let file = std::fs::File::open(input)
         .map_err(|e| Error::failure(format!("cannot open the input: {e}")).in_file(input))?;
-    Ok(Box::new(Y4m::new(Box::new(file), &input.display().to_string(), fps)?))
+    let y4m = Y4m::new(Box::new(file), &input.display().to_string(), fps)?;
+    Ok(Box::new(WithoutRepeats::new(y4m)))
 }
