@@ -14,7 +14,7 @@ use crate::error::Result;
 use crate::kernel::Level;
 use crate::kernel::bands::{self, BANDS_MAX, Jobs, rows_per_band};
 use crate::kernel::scalar::bits::{self, stride};
-use crate::kernel::scalar::texture::{NO_TEXTURE, SUMS_BORDER, Sums};
+use crate::kernel::scalar::texture::{Belt, NO_TEXTURE, SUMS_BORDER, Sums};
 use crate::kernel::simd::texture::{correlate, extract};
 use crate::plan::{Block, Memory, Plan};
 use crate::stage::background::Background;
@@ -209,7 +209,7 @@ impl Odometry {
     /// Belt texture of the zone: the view minus the background, where it is belt.
     fn extract(&mut self, grey: &[u8], background: &Background, covered: &[u64]) {
         let (words, stride) = (bits::words(self.width), stride(self.width));
-        let (mean, gain) = background.belt();
+        let belt = background.belt();
         let blocks = Self::blocks(&self.columns);
         let (columns, first, step) = (self.columns.clone(), self.rows.start, self.row_step);
         let rows = rows_per_band(self.current.len() / blocks.len(), self.bands);
@@ -222,7 +222,7 @@ impl Odometry {
                 let v = first + i * step;
                 let pixels = v * stride + blocks.start..v * stride + blocks.end;
                 let covered = &covered[v * words..][blocks.start / 64..blocks.end / 64];
-                let belt = (&mean[pixels.clone()], gain);
+                let belt = Belt { mean: &belt.mean[pixels.clone()], ..belt };
                 extract(level, &grey[pixels], belt, covered, sums, out);
                 out[..columns.start - blocks.start].fill(NO_TEXTURE);
                 out[columns.end - blocks.start..].fill(NO_TEXTURE);
