@@ -35,6 +35,8 @@ const HOLD_MARGIN_PX: usize = 2;
 /// carry the parcel's own, faster motion into them.
 const COVER_MARGIN_PX: usize = 8;
 
+/// What is narrower than this many px cannot be told from a sliver of shadow.
+const SIDE_MIN_PX: f64 = 4.0;
 /// A blob whose middle is this near to a parcel's silhouette is a piece of that parcel.
 const PIECE_MARGIN_PX: f64 = 8.0;
 
@@ -371,10 +373,12 @@ impl Pipeline {
         let had_shape = self.measure.outline(slot, self.at).is_some();
         let measured = self.measure.finish(slot, reference.at);
         // A sliver of shadow or light is smaller than the smallest blob that counts.
-        let area_min_mm2 = self.site.config.segment.area_min_mm2;
+        let segment = &self.site.config.segment;
+        let side_min_mm = segment.side_min_mm.unwrap_or(SIDE_MIN_PX * self.site.view.mm_per_px);
         let is_sliver = |m: &Measured| {
             let p = &m.estimate.params;
-            p[measure::LENGTH] * p[measure::WIDTH] < area_min_mm2
+            p[measure::LENGTH] * p[measure::WIDTH] < segment.area_min_mm2
+                || p[measure::WIDTH] < side_min_mm
         };
         if measured.as_ref().is_some_and(is_sliver) {
             self.counters.slivers += 1;

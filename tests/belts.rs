@@ -32,19 +32,23 @@ const SIZE_MM: [f64; 3] = [200.0, 120.0, 80.0];
 const SPEED_MM_PER_S: f64 = 500.0;
 
 /// Boxes half a metre apart, on a belt of this texture, with `tables` besides.
-fn boxes(count: u32, grey: f64, texture_grey: f64, tables: &str) -> Scenario {
-    let [l, w, h] = SIZE_MM;
-    let frames = 105 + 30 * count;
+fn boxes(count: usize, grey: f64, texture_grey: f64, tables: &str) -> Scenario {
+    belt(&vec![(SIZE_MM, 8.0); count], grey, texture_grey, tables)
+}
+
+/// Parcels, size and yaw in degrees, half a metre apart.
+fn belt(parcels: &[([f64; 3], f64)], grey: f64, texture_grey: f64, tables: &str) -> Scenario {
+    let frames = 105 + 30 * parcels.len();
     let mut text = format!(
         "seed = 3\nfps = 30\nframes = {frames}\nexposure_ms = 1\n{CAMERA}\
          [belt]\nspeed_mm_per_s = {SPEED_MM_PER_S}\nwidth_mm = 800\ngrey = {grey}\n\
          texture_grey = {texture_grey}\n{tables}\n"
     );
-    for k in 0..count {
-        let x_mm = -1000.0 - 500.0 * f64::from(k);
+    for (k, ([l, w, h], yaw_deg)) in parcels.iter().enumerate() {
+        let x_mm = -1000.0 - 500.0 * k as f64;
         let _ = writeln!(
             text,
-            "[[parcel]]\nlength_mm = {l}\nwidth_mm = {w}\nheight_mm = {h}\nyaw_deg = 8\n\
+            "[[parcel]]\nlength_mm = {l}\nwidth_mm = {w}\nheight_mm = {h}\nyaw_deg = {yaw_deg}\n\
              x_mm = {x_mm}\ny_mm = 20\nmaterial = \"white\""
         );
     }
@@ -210,4 +214,54 @@ fn an_encoder_that_shows_another_travel_than_the_belt_is_found_out() {
         let (found, sigma) = health.encoder_ratio.expect("compared");
         assert!(health.encoder_disagrees && (found - ratio).abs() < 0.002, "{found} +- {sigma}");
     }
+}
+
+/// Boxes of random size on random belts, of whose frames a random share is missing.
+fn with_frames_dropped(belts: std::ops::Range<u64>) {
+    let mut wrong = String::new();
+    for seed in belts {
+        let mut state = seed.wrapping_mul(0x9e37_79b9_7f4a_7c15) | 1;
+        let mut random = move || {
+            state ^= state << 13;
+            state ^= state >> 7;
+            state ^= state << 17;
+            (state >> 40) as f64 / f64::from(1 << 24)
+        };
+        let share = 0.6 * random();
+        let mut parcel = || {
+            let [w, h, yaw] = [100.0 * random(), 200.0 * random(), 180.0 * random()];
+            ([200.0, 60.0 + w, 20.0 + h], yaw)
+        };
+        let parcels = [parcel(), parcel()];
+        let mut scenario = belt(&parcels, 60.0, 2.0, "");
+        scenario.frames += 20;
+        let mut source = Synthetic::new(scenario.clone()).expect("renders");
+        let (mut frames, mut pipeline) =
+            beltgauge::run::build(site(&scenario, 500.0)).expect("fits");
+        let mut frame = frames.pop().expect("planned");
+        let mut records = Vec::new();
+        while let Some(time) = source.next_into(&mut frame).expect("renders") {
+            if time.index > 20 && random() < share {
+                continue;
+            }
+            let raw = Plane::packed(&frame, 640, 400).expect("this size");
+            pipeline.step(raw, time, &mut |r| records.push(r)).expect("this size");
+        }
+        pipeline.finish(&mut |r| records.push(r));
+        if records.len() != 2 {
+            let _ = writeln!(wrong, "belt {seed}, {share:.2} dropped: {records:#?}");
+        }
+    }
+    assert!(wrong.is_empty(), "{wrong}");
+}
+
+#[test]
+fn with_frames_dropped_at_random_every_parcel_is_told_once() {
+    with_frames_dropped(0..20);
+}
+
+#[test]
+#[ignore = "minutes"]
+fn with_frames_dropped_on_many_belts_every_parcel_is_told_once() {
+    with_frames_dropped(20..220);
 }
