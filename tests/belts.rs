@@ -113,7 +113,10 @@ fn assert_honest(records: &[ParcelRecord], count: usize) {
 fn a_plain_belt_frozen_by_compression_does_not_stand() {
     let scenario = boxes(3, 60.0, 0.0, "");
     let mut last: Option<Vec<u8>> = None;
-    let (records, _) = run(&scenario, site(&scenario, 500.0), |_, frame, _| {
+    let mut stood = 0;
+    let (records, _) = run(&scenario, site(&scenario, 500.0), |pipeline, frame, _| {
+        let (speed, measured) = pipeline.belt_motion();
+        stood += u32::from(measured && speed.abs() < 0.5 * SPEED_MM_PER_S);
         // What differs by noise only is repeated, as encoders do.
         if let Some(last) = &last {
             for (new, &old) in frame.iter_mut().zip(last) {
@@ -122,6 +125,7 @@ fn a_plain_belt_frozen_by_compression_does_not_stand() {
         }
         last = Some(frame.to_vec());
     });
+    assert_eq!(stood, 0, "frames in which a standstill was measured");
     assert_honest(&records, 3);
 }
 
