@@ -14,6 +14,8 @@ pub struct BeltPosition {
     pub travel_mm: f64,
     /// The part of it that was measured rather than assumed from the speed.
     pub measured_mm: f64,
+    /// Times that the belt was lost: nothing is known of the travel over such a break.
+    pub breaks: u32,
 }
 
 impl BeltPosition {
@@ -25,12 +27,60 @@ impl BeltPosition {
         }
     }
 
+    /// What comes is no travel from here.
+    pub fn lose(&mut self) {
+        self.breaks = self.breaks.wrapping_add(1);
+    }
+
     /// Relative standard uncertainty of the travel since `start`.
     pub fn sigma_since(&self, start: &Self) -> f64 {
+        if self.breaks != start.breaks {
+            return 1.0;
+        }
         let travel = self.travel_mm - start.travel_mm;
         let assumed = travel - (self.measured_mm - start.measured_mm);
         let share = if travel.abs() > 1e-6 { (assumed / travel).clamp(0.0, 1.0) } else { 1.0 };
         MEASURED_SIGMA.hypot(NOMINAL_SIGMA * share)
+    }
+}
+
+/// Travel over which encoder and texture are compared, mm: beyond it, older travel fades.
+const COMPARED_MM: f64 = 4000.0;
+/// Less travel compares nothing, mm.
+const COMPARED_MIN_MM: f64 = 300.0;
+/// Standard uncertainty of either end of the compared travel, mm: jitter of the counts.
+const COMPARED_SIGMA_MM: f64 = 0.7;
+/// Beyond so many standard uncertainties encoder and texture disagree.
+const DISAGREE_SIGMA: f64 = 4.0;
+
+/// An encoder's travel over that of the belt's texture.
+#[derive(Clone, Copy, Debug, Default)]
+pub struct EncoderRatio {
+    encoder_mm: f64,
+    texture_mm: f64,
+}
+
+impl EncoderRatio {
+    /// The travel of a frame, by both.
+    pub fn add(&mut self, encoder_mm: f64, texture_mm: f64) {
+        self.encoder_mm += encoder_mm;
+        self.texture_mm += texture_mm;
+        if self.texture_mm.abs() > COMPARED_MM {
+            self.encoder_mm *= 0.5;
+            self.texture_mm *= 0.5;
+        }
+    }
+
+    /// The ratio and its standard uncertainty; `None` before the belt has travelled far enough.
+    pub fn ratio(&self) -> Option<(f64, f64)> {
+        let travel_mm = self.texture_mm.abs();
+        let sigma = MEASURED_SIGMA.hypot(2f64.sqrt() * COMPARED_SIGMA_MM / travel_mm);
+        (travel_mm >= COMPARED_MIN_MM).then(|| (self.encoder_mm / self.texture_mm, sigma))
+    }
+
+    /// Whether the encoder shows another travel than the texture.
+    pub fn disagrees(&self) -> bool {
+        self.ratio().is_some_and(|(ratio, sigma)| (ratio - 1.0).abs() > DISAGREE_SIGMA * sigma)
     }
 }
 
@@ -130,7 +180,7 @@ mod tests {
 
     #[test]
     fn uncertainty_grows_with_the_share_that_was_only_assumed() {
-        let start = BeltPosition { travel_mm: 100.0, measured_mm: 40.0 };
+        let start = BeltPosition { travel_mm: 100.0, measured_mm: 40.0, breaks: 0 };
         let mut all = start;
         all.advance(500.0, true);
         let mut half = start;
@@ -139,6 +189,29 @@ mod tests {
         assert!(all.sigma_since(&start) < 0.0004);
         assert!((half.sigma_since(&start) - NOMINAL_SIGMA / 2.0).abs() < 1e-4);
         assert!(start.sigma_since(&start) > 0.02, "no travel, nothing measured");
+        all.lose();
+        assert!(all.sigma_since(&start) > 0.5, "nothing is known over a break");
+    }
+
+    #[test]
+    fn an_encoder_a_percent_off_or_stuck_disagrees_and_a_right_one_does_not() {
+        let compared = |ratio: f64, frames: u32| {
+            let mut compared = EncoderRatio::default();
+            for k in 0..frames {
+                // Jitter of half a mm, to and fro.
+                let jitter_mm = if k % 2 == 0 { 0.5 } else { -0.5 };
+                compared.add(ratio * 12.5 + jitter_mm, 12.5);
+            }
+            compared
+        };
+        assert!(compared(1.01, 10).ratio().is_none(), "too early to tell");
+        for frames in [30, 100, 1000, 10_000] {
+            assert!(!compared(1.0, frames).disagrees(), "{frames}");
+            assert!(compared(0.0, frames).disagrees(), "{frames}");
+        }
+        let (ratio, sigma) = compared(1.01, 1000).ratio().expect("far enough");
+        assert!((ratio - 1.01).abs() < 2.0 * sigma && sigma < 0.001, "{ratio} {sigma}");
+        assert!(compared(1.01, 1000).disagrees());
     }
 
     /// 0.05 mm a count, 16 bits, at 500 mm/s; a count every `period_s`, `jitter_s` late at times.

@@ -4,6 +4,10 @@
 //! Owns: every stage, in one mapping planned from the configuration. Reads no clock, draws no
 //! random number, allocates nothing: a recording replays to the same records on every run.
 
+mod motion;
+
+pub use motion::Health;
+
 use crate::belt::BeltPosition;
 use crate::config::Site;
 use crate::error::{Error, Result};
@@ -14,11 +18,13 @@ use crate::kernel::scalar::bits::{self, Square, words};
 use crate::plan::{Block, Memory, Plan};
 use crate::stage::background::Background;
 use crate::stage::measure::{self, Frame, Measure, Measured};
-use crate::stage::odometry::{Motion, Odometry};
+use crate::stage::odometry::{Expected, Odometry};
 use crate::stage::rectify::Rectify;
+use crate::stage::riders::Riders;
 use crate::stage::segment::{PxBox, Segment};
 use crate::stage::track::{Change, NOBODY, Phase, Track, Tracker};
 use crate::units::{BeltMm, BeltPx, BeltRect};
+use motion::Witnesses;
 use nalgebra::Vector2;
 
 /// Above this relative sigma the belt speed counts as assumed.
@@ -29,8 +35,8 @@ const HOLD_MARGIN_PX: usize = 2;
 /// carry the parcel's own, faster motion into them.
 const COVER_MARGIN_PX: usize = 8;
 
-/// An encoder that shows less than this share of the nominal speed stands still.
-const STILL: f64 = 0.1;
+/// What is narrower than this many px cannot be told from a sliver of shadow.
+const SIDE_MIN_PX: f64 = 4.0;
 /// A blob whose middle is this near to a parcel's silhouette is a piece of that parcel.
 const PIECE_MARGIN_PX: f64 = 8.0;
 
@@ -53,6 +59,7 @@ pub struct Pipeline {
     background: Background,
     odometry: Odometry,
     segment: Segment,
+    riders: Riders,
     tracker: Tracker,
     measure: Measure,
     /// Bit mask: parcels and their surroundings in the last frame.
@@ -62,11 +69,8 @@ pub struct Pipeline {
     scratch: Block<u64>,
     references: Block<Reference>,
     at: BeltPosition,
-    /// The encoder's belt position at the coming frame, and at the last one, mm.
-    encoder_mm: [Option<f64>; 2],
+    witnesses: Witnesses,
     stands_still: bool,
-    /// By the encoder, in the last frame.
-    encoder_speed_mm_per_s: Option<f64>,
     reporting: bool,
     last: Option<FrameTime>,
     counters: Counters,
@@ -80,6 +84,7 @@ impl Pipeline {
         Background::plan(size, plan);
         Odometry::plan(&site.view, &site.config.zone, plan);
         Segment::plan(size, limits, plan);
+        Riders::plan(size, plan);
         Tracker::plan(limits.tracks_max, limits.blobs_max, plan);
         Measure::plan(limits.tracks_max, limits.views_per_track_max, plan);
         let mask = words(size[0]) * size[1];
@@ -103,14 +108,18 @@ impl Pipeline {
         let odometry = Odometry::new(
             view,
             &zone,
-            config.belt.speed_mm_per_s,
-            config.odometry.speed_error_max,
+            Expected {
+                nominal_mm_per_s: config.belt.speed_mm_per_s,
+                speed_error_max: config.odometry.speed_error_max,
+                magnification_max,
+            },
             level,
             bands,
             memory,
         )?;
         let segment =
             Segment::new(view.size_px, view.mm_per_px, config.segment.clone(), bands, memory)?;
+        let riders = Riders::new(view.mm_per_px, memory)?;
         let tracker = Tracker::new(view.mm_per_px, magnification_max, memory)?;
         let measure = Measure::new(
             view.clone(),
@@ -126,6 +135,7 @@ impl Pipeline {
             background,
             odometry,
             segment,
+            riders,
             tracker,
             measure,
             covered: memory.take("pipeline.covered", 0)?,
@@ -133,9 +143,8 @@ impl Pipeline {
             scratch: memory.take("pipeline.scratch", 0)?,
             references: memory.take("pipeline.references", nowhere)?,
             at: BeltPosition::default(),
-            encoder_mm: [None; 2],
+            witnesses: Witnesses::default(),
             stands_still: false,
-            encoder_speed_mm_per_s: None,
             reporting: true,
             last: None,
             counters: Counters::default(),
@@ -160,25 +169,30 @@ impl Pipeline {
         self.rectify.step(raw);
         self.hold_background();
         self.background.step(self.rectify.pixels(), self.rectify.seen(), &self.hold);
-        let by_encoder = self.encoder_motion();
-        self.encoder_speed_mm_per_s =
-            by_encoder.as_ref().filter(|_| dt_s > 0.0).map(|motion| motion.step_mm / dt_s);
+        let by_encoder = self.witnesses.encoder_step_mm();
+        if !self.odometry.bridges(dt_s) {
+            self.lose_belt(emit);
+        }
+        let dt_s = if self.odometry.bridges(dt_s) { dt_s } else { 0.0 };
         if !self.background.learned() {
             let assumed_mm = self.odometry.speed().0 * dt_s;
-            let (step_mm, measured) =
-                by_encoder.map_or((assumed_mm, false), |motion| (motion.step_mm, true));
-            self.at.advance(step_mm, measured);
+            self.witnesses.encoder_alone(by_encoder, dt_s);
+            self.at.advance(by_encoder.unwrap_or(assumed_mm), by_encoder.is_some());
             return Ok(());
         }
         let background = &self.background;
         self.segment.step(background.foreground(), background.strong(), background.dark());
         self.cover();
-        let motion =
-            self.odometry.step(self.rectify.pixels(), &self.background, &self.covered, dt_s);
-        self.stands_still = by_encoder.map_or(self.odometry.stands_still(), |motion| {
-            motion.step_mm.abs() < STILL * self.site.config.belt.speed_mm_per_s * dt_s
-        });
-        let motion = by_encoder.unwrap_or(motion);
+        self.riders.step(self.segment.runs(), dt_s);
+        let ride = self.riders.ride();
+        let grey = self.rectify.pixels();
+        let texture = self.odometry.step(grey, &self.background, &self.covered, ride, dt_s);
+        let decided = self.witnesses.decide(by_encoder, texture, &self.odometry, ride, dt_s);
+        if decided.changed {
+            self.at.lose();
+        }
+        self.stands_still = decided.stands_still;
+        let motion = decided.motion;
         self.at.advance(motion.step_mm, motion.measured);
         self.track(motion.step_mm);
         self.measure_tracks(time, motion.step_mm);
@@ -191,7 +205,23 @@ impl Pipeline {
     /// The belt's position at the next frame, mm from anywhere, as an encoder tells it. It outdoes
     /// the belt's texture; a frame without it falls back to that.
     pub fn encoder(&mut self, position_mm: f64) {
-        self.encoder_mm[0] = Some(position_mm).filter(|mm| mm.is_finite());
+        self.witnesses.encoder(position_mm);
+    }
+
+    /// Over a gap that the view cannot bridge (frames missing, time stamps that run back) nothing is
+    /// known of the belt: what was inside is told, and followed no more.
+    fn lose_belt(&mut self, emit: &mut dyn FnMut(ParcelRecord)) {
+        for slot in 0..self.tracker.tracks().len() {
+            if self.tracker.tracks()[slot].phase == Phase::Riding {
+                self.counters.lost += 1;
+                self.emit(slot, Flags::LOST, emit);
+            }
+        }
+        self.tracker.forget();
+        self.odometry.forget();
+        self.riders.forget();
+        self.at.lose();
+        self.stands_still = false;
     }
 
     /// The belt is empty: forget what it looked like, and the parcels in view, and learn it anew.
@@ -199,19 +229,13 @@ impl Pipeline {
         self.background.forget();
         self.tracker.forget();
         self.odometry.forget();
+        self.riders.forget();
         self.stands_still = false;
     }
 
     /// Report parcels, or let them pass.
     pub fn report_parcels(&mut self, reporting: bool) {
         self.reporting = reporting;
-    }
-
-    /// The belt's motion since the last frame, if the encoder was read at both.
-    fn encoder_motion(&mut self) -> Option<Motion> {
-        let [here, before] = self.encoder_mm;
-        self.encoder_mm = [None, here];
-        Some(Motion { step_mm: here? - before?, measured: true })
     }
 
     /// The input has ended: report what is still inside, flagged unfinished.
@@ -349,10 +373,12 @@ impl Pipeline {
         let had_shape = self.measure.outline(slot, self.at).is_some();
         let measured = self.measure.finish(slot, reference.at);
         // A sliver of shadow or light is smaller than the smallest blob that counts.
-        let area_min_mm2 = self.site.config.segment.area_min_mm2;
+        let segment = &self.site.config.segment;
+        let side_min_mm = segment.side_min_mm.unwrap_or(SIDE_MIN_PX * self.site.view.mm_per_px);
         let is_sliver = |m: &Measured| {
             let p = &m.estimate.params;
-            p[measure::LENGTH] * p[measure::WIDTH] < area_min_mm2
+            p[measure::LENGTH] * p[measure::WIDTH] < segment.area_min_mm2
+                || p[measure::WIDTH] < side_min_mm
         };
         if measured.as_ref().is_some_and(is_sliver) {
             self.counters.slivers += 1;
@@ -496,6 +522,12 @@ impl Pipeline {
         self.counters
     }
 
+    /// What the pipeline knows of its own condition.
+    pub fn health(&self) -> Health {
+        let contrast_min_grey = self.background.contrast_min_grey();
+        self.witnesses.health(&self.odometry, self.riders.ride(), contrast_min_grey)
+    }
+
     /// Whether the empty belt has been learned.
     pub fn ready(&self) -> bool {
         self.background.learned()
@@ -508,7 +540,7 @@ impl Pipeline {
 
     /// The belt's motion in the last frame, and whether it was measured.
     pub fn belt_motion(&self) -> (f64, bool) {
-        match self.encoder_speed_mm_per_s {
+        match self.witnesses.encoder_speed_mm_per_s() {
             Some(speed_mm_per_s) => (speed_mm_per_s, true),
             None => self.odometry.speed(),
         }
@@ -531,7 +563,7 @@ impl Pipeline {
 
     /// Whether that was by the encoder.
     pub fn by_encoder(&self) -> bool {
-        self.encoder_speed_mm_per_s.is_some()
+        self.witnesses.encoder_speed_mm_per_s().is_some()
     }
 
     /// The site it was built for.

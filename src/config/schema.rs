@@ -198,11 +198,14 @@ pub struct Segment {
     pub close_px: usize,
     /// Blobs smaller than this on the belt are ignored.
     pub area_min_mm2: f64,
+    /// What is narrower than this is a sliver of shadow or light, no parcel; default: 4 px of the
+    /// view.
+    pub side_min_mm: Option<f64>,
 }
 
 impl Default for Segment {
     fn default() -> Self {
-        Self { open_px: 1, close_px: 3, area_min_mm2: 300.0 }
+        Self { open_px: 1, close_px: 3, area_min_mm2: 300.0, side_min_mm: None }
     }
 }
 
@@ -503,6 +506,9 @@ impl Config {
         count("segment.open_px", segment.open_px, 0, 10)?;
         count("segment.close_px", segment.close_px, 0, 30)?;
         range("segment.area_min_mm2", segment.area_min_mm2, 1.0, 1e6, "mm2")?;
+        if let Some(side_min_mm) = segment.side_min_mm {
+            range("segment.side_min_mm", side_min_mm, 0.0, 1000.0, "mm")?;
+        }
         range("odometry.speed_error_max", odometry.speed_error_max, 0.0, 0.2, "")?;
         range("measure.edge_radius_mm", measure.edge_radius_mm, 0.0, 20.0, "mm")?;
         range("measure.sigma_max_mm", measure.sigma_max_mm, 0.1, 100.0, "mm")?;

@@ -15,6 +15,7 @@ use crate::kernel::scalar::bits::{stride, words};
 use crate::kernel::scalar::mixture::{
     Gain, MATCH_Q8, MINORS, Params, Rate, VARIANCE_NEW, observation,
 };
+use crate::kernel::scalar::texture::{Belt, texture_shift};
 use crate::kernel::simd::mixture::{Masks, Minors, Model, update};
 use crate::plan::{Block, Memory, Plan};
 
@@ -33,14 +34,23 @@ const GAIN_BINS_NEAR: usize = 8;
 const BACKGROUND_SHARE: u8 = 229;
 
 const MINOR_BLOCKS: [[&str; 3]; MINORS] = [
-    ["background.mean_1", "background.variance_1", "background.weight_1"],
-    ["background.mean_2", "background.variance_2", "background.weight_2"],
+    ["background.mean_1", "background.deviation_1", "background.weight_1"],
+    ["background.mean_2", "background.deviation_2", "background.weight_2"],
 ];
+
+/// Bin with the middle one of `count` votes.
+fn median(votes: impl IntoIterator<Item = u32>, count: u32) -> Option<usize> {
+    let mut below = 0;
+    votes.into_iter().position(|votes| {
+        below += votes;
+        below * 2 > count
+    })
+}
 
 /// A weaker mode of every pixel.
 struct Minor {
     mean: Block<u16>,
-    variance: Block<u8>,
+    deviation: Block<u8>,
     weight: Block<u8>,
 }
 
@@ -71,6 +81,8 @@ pub struct Background {
     gain_step_px: usize,
     /// Model brightness over scene brightness, Q15.
     gain_q15: u32,
+    /// Median standard deviation of the belt, Q3.
+    deviation_q3: u16,
     frames: u32,
 }
 
@@ -80,9 +92,9 @@ impl Background {
         let (pixels, words) = (stride(width) * height, words(width) * height);
         plan.add::<u16>("background.mean", pixels, "mixture model, the main mode of each pixel");
         plan.add::<u16>("background.variance", pixels, "mixture model, the main mode");
-        for [mean, variance, weight] in MINOR_BLOCKS {
+        for [mean, deviation, weight] in MINOR_BLOCKS {
             plan.add::<u16>(mean, pixels, "mixture model, a weaker mode; seldom touched");
-            plan.add::<u8>(variance, pixels, "mixture model, a weaker mode");
+            plan.add::<u8>(deviation, pixels, "mixture model, a weaker mode");
             plan.add::<u8>(weight, pixels, "mixture model, a weaker mode");
         }
         plan.add::<u64>("background.multiple", words, "bit: the pixel has a weaker mode");
@@ -102,10 +114,10 @@ impl Background {
     ) -> Result<Self> {
         let mean = memory.take("background.mean", 0)?;
         let variance = memory.take("background.variance", VARIANCE_NEW)?;
-        let mut minor = |[mean, variance, weight]: [&'static str; 3]| -> Result<Minor> {
+        let mut minor = |[mean, deviation, weight]: [&'static str; 3]| -> Result<Minor> {
             Ok(Minor {
                 mean: memory.take(mean, 0)?,
-                variance: memory.take(variance, 0)?,
+                deviation: memory.take(deviation, 0)?,
                 weight: memory.take(weight, 0)?,
             })
         };
@@ -125,6 +137,7 @@ impl Background {
             gain_histogram: memory.take("background.gain", GainBin::default())?,
             gain_step_px: (width * height / GAIN_VOTES).isqrt().max(1),
             gain_q15: GAIN_ONE,
+            deviation_q3: 0,
             frames: 0,
         })
     }
@@ -146,11 +159,15 @@ impl Background {
         let rows = rows_per_band(height, self.bands);
         let (pixels, words) = (rows * stride(self.width), rows * words(self.width));
         let mut minors = self.minors.each_mut().map(|m| {
-            (m.mean.chunks_mut(pixels), m.variance.chunks_mut(pixels), m.weight.chunks_mut(pixels))
+            (m.mean.chunks_mut(pixels), m.deviation.chunks_mut(pixels), m.weight.chunks_mut(pixels))
         });
         let mut minor = |k: usize| {
-            let (mean, variance, weight) = &mut minors[k];
-            Some(Minors { mean: mean.next()?, variance: variance.next()?, weight: weight.next()? })
+            let (mean, deviation, weight) = &mut minors[k];
+            Some(Minors {
+                mean: mean.next()?,
+                deviation: deviation.next()?,
+                weight: weight.next()?,
+            })
         };
         let (mut mean, mut variance) =
             (self.mean.chunks_mut(pixels), self.variance.chunks_mut(pixels));
@@ -205,11 +222,14 @@ impl Background {
         let (n, stride, step) = (words(self.width), stride(self.width), self.gain_step_px);
         let histogram = &mut self.gain_histogram;
         histogram.fill(GainBin::default());
+        let mut deviations = [0u32; 256];
         let mut count = 0;
         for v in (0..self.mean.len() / stride).step_by(step) {
             for u in (0..self.width).step_by(step) {
                 let (scene, model) = (grey[v * stride + u], self.mean[v * stride + u]);
                 let word = v * n + u / 64;
+                deviations[usize::from(self.variance[v * stride + u].isqrt())] +=
+                    u32::from(seen[word] >> (u % 64) & 1 == 1);
                 let is_belt = (seen[word] & !self.foreground[word]) >> (u % 64) & 1 == 1;
                 if is_belt && model >= GAIN_MEAN_MIN {
                     let ratio = u32::from(scene) * 128 * GAIN_BIN_ONE / u32::from(model);
@@ -221,12 +241,11 @@ impl Background {
                 }
             }
         }
-        let mut below = 0;
-        let median = histogram.iter().position(|bin| {
-            below += bin.votes;
-            below * 2 > count
-        });
-        let Some(median) = median else { return self.gain_q15 };
+        let all = deviations.iter().sum();
+        self.deviation_q3 = median(deviations, all).unwrap_or_default() as u16;
+        let Some(median) = median(histogram.iter().map(|bin| bin.votes), count) else {
+            return self.gain_q15;
+        };
         let near =
             median.saturating_sub(GAIN_BINS_NEAR)..GAIN_BINS.min(median + GAIN_BINS_NEAR + 1);
         let (mut scene, mut model) = (0u64, 0u64);
@@ -237,6 +256,17 @@ impl Background {
         // Both sums are over the same pixels; the model is in Q7.
         let gain = model * u64::from(GAIN_ONE) / (scene * 128).max(1);
         gain.clamp(u64::from(GAIN_ONE / 4), 65535) as u32
+    }
+
+    /// Standard deviation of a belt pixel over time, grey levels: its texture as it passes, and the
+    /// camera's noise. Median over the view.
+    pub fn belt_sigma_grey(&self) -> f64 {
+        f64::from(self.deviation_q3) / 8.0
+    }
+
+    /// Grey levels by which a parcel must differ from the belt to be beyond doubt.
+    pub fn contrast_min_grey(&self) -> f64 {
+        2.0 * self.settings.threshold_sigma * self.belt_sigma_grey()
     }
 
     /// Learn anew, from the next frame on.
@@ -268,9 +298,12 @@ impl Background {
         &self.strong
     }
 
-    /// The belt's mean, Q7, row by row of [`stride`] pixels, and the light of this frame: what a
-    /// grey level is to be compared with.
-    pub fn belt(&self) -> (&[u16], Gain) {
-        (&self.mean, Gain::from_q15(self.gain_q15))
+    /// What grey levels are to be compared with, row by row of [`stride`] pixels.
+    pub fn belt(&self) -> Belt<'_> {
+        Belt {
+            mean: &self.mean,
+            gain: Gain::from_q15(self.gain_q15),
+            shift: texture_shift(self.belt_sigma_grey()),
+        }
     }
 }

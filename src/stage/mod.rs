@@ -4,5 +4,6 @@ pub mod background;
 pub mod measure;
 pub mod odometry;
 pub mod rectify;
+pub mod riders;
 pub mod segment;
 pub mod track;

@@ -6,8 +6,10 @@
 //! is read and written in 4 bytes of model. Everything that such a pixel needs fits products of
 //! 8 by 8 bits in 16-bit lanes, so that the vector kernel gives the same bits.
 //!
-//! Units: means Q7 grey levels, variances Q10 grey levels squared, weights in 1/255. Increments
+//! Units: means Q7 grey levels, variances Q6 grey levels squared, weights in 1/255. Increments
 //! smaller than one unit are dithered over the frames, so that none is ever lost.
+//! Range: standard deviations of 1.2 to 32 grey levels, distances without limit. A distance counts
+//! as at most 32 grey levels when it is learned: a belt of 20 is learned as one of 17.
 
 /// Weaker modes that a pixel may have besides its main one.
 pub const MINORS: usize = 2;
@@ -17,8 +19,8 @@ pub const MINORS: usize = 2;
 pub struct Minor {
     /// Mean, Q7.
     pub mean: u16,
-    /// Variance, Q2: the upper byte of Q10.
-    pub variance: u8,
+    /// Standard deviation, Q3: its square is a variance in Q6.
+    pub deviation: u8,
     /// Share of the observations, 1/255. The main mode has what is left.
     pub weight: u8,
 }
@@ -28,7 +30,7 @@ pub struct Minor {
 pub struct Pixel {
     /// Mean of the main mode, Q7.
     pub mean: u16,
-    /// Variance of the main mode, Q10.
+    /// Variance of the main mode, Q6.
     pub variance: u16,
     /// The weaker modes, the heavier first.
     pub minors: [Minor; MINORS],
@@ -116,18 +118,23 @@ pub struct Params {
 
 /// 1 / (standard deviations within which a mode learns an observation), Q8: 3, as in the paper.
 pub const MATCH_Q8: u16 = 85;
-/// Variance of a new mode: 5 grey levels squared, Q10.
-pub const VARIANCE_NEW: u16 = 25 << 10;
+/// Variance of a new mode: 5 grey levels squared, Q6.
+pub const VARIANCE_NEW: u16 = 25 << 6;
 /// A sensor is never better than 1.2 grey levels, quantisation and interpolation included.
-pub const VARIANCE_MIN: u16 = 1480;
+pub const VARIANCE_MIN: u16 = 92;
+/// Its root, Q3, rounded up.
+const DEVIATION_MIN: u8 = 10;
 /// Below this a mean cannot carry a ratio: 6 grey levels, Q7.
 pub const SHADOW_MEAN_MIN: u16 = 6 << 7;
 /// Complexity prior `c_T` of eq. 14: 0.05 of 255.
 pub const PRIOR: u16 = 13;
 
+/// Deviations are compared up to this, Q5: 32 grey levels, and beyond every variance.
+pub const REACH_MAX: u16 = 1023;
+
 /// Bits that the mean's unit has more than that of [`distance`].
 pub const MEAN_GAINED: u32 = 4;
-/// Bits that the variance's unit has more than its eight upper ones.
+/// Bits that a step of the variance loses before it is dithered.
 pub const VARIANCE_GAINED: u32 = 8;
 
 /// What a pixel shows.
@@ -154,23 +161,29 @@ fn distance(x: u16, mean: u16) -> u16 {
     (x.abs_diff(mean) >> 4).min(255)
 }
 
-/// Distance over the reach, Q5, at most 255.
-fn reach(x: u16, mean: u16, reach_q8: u16) -> u16 {
-    ((distance(x, mean) * reach_q8) >> 6).min(255)
+/// Square, Q6, of a deviation in Q5 of at most [`REACH_MAX`].
+fn square(deviation: u16) -> u16 {
+    let (whole, quarters) = (deviation >> 2, deviation & 3);
+    whole * whole + ((8 * whole * quarters + quarters * quarters) >> 4)
+}
+
+/// Square, Q6, of a distance over the reach, `halves` times halved before.
+fn reach(x: u16, mean: u16, reach_q8: u16, halves: u32) -> u16 {
+    square((part_of(x.abs_diff(mean), reach_q8) >> (2 + halves)).min(REACH_MAX))
 }
 
 fn within(x: u16, mean: u16, variance: u16, reach_q8: u16) -> bool {
-    reach(x, mean, reach_q8).pow(2) < variance
+    reach(x, mean, reach_q8, 0) < variance
 }
 
 /// At more than twice the distance that makes a pixel foreground, from the main mode.
 pub fn is_strong(x: u16, pixel: &Pixel, params: &Params) -> bool {
-    (reach(x, pixel.mean, params.reach_q8) / 2).pow(2) >= pixel.variance
+    reach(x, pixel.mean, params.reach_q8, 1) >= pixel.variance
 }
 
-/// `ratio * mean`, Q7, the ratio in Q8.
-fn part_of(mean: u16, ratio_q8: u16) -> u16 {
-    (mean >> 8) * ratio_q8 + (((mean & 255) * ratio_q8) >> 8)
+/// `ratio * value`, the ratio in Q8 and at most 1.
+fn part_of(value: u16, ratio_q8: u16) -> u16 {
+    (value >> 8) * ratio_q8 + (((value & 255) * ratio_q8) >> 8)
 }
 
 /// How much darker than a mode's mean: shadow, dark, or neither.
@@ -197,7 +210,7 @@ pub fn classify(x: u16, pixel: &Pixel, params: &Params) -> Class {
         if minor.weight == 0 || share >= params.background_share {
             break;
         }
-        if within(x, minor.mean, minor.variance_q10(), params.reach_q8) {
+        if within(x, minor.mean, minor.variance(), params.reach_q8) {
             return Class::Background;
         }
         class = match (class, shade(x, minor.mean, params)) {
@@ -225,11 +238,11 @@ impl Minor {
     pub fn new(x: u16, rate: &Rate) -> Self {
         let (mantissa, shift, dither) = rate.for_weight();
         let weight = ((255 * mantissa + dither) >> shift) as u8;
-        Self { mean: x, variance: (VARIANCE_NEW >> VARIANCE_GAINED) as u8, weight }
+        Self { mean: x, deviation: VARIANCE_NEW.isqrt() as u8, weight }
     }
 
-    fn variance_q10(self) -> u16 {
-        u16::from(self.variance) << VARIANCE_GAINED
+    fn variance(self) -> u16 {
+        u16::from(self.deviation).pow(2)
     }
 
     /// Eq. 5 and 6 at rate / weight: a young mode is the mean of what it has seen.
@@ -240,10 +253,12 @@ impl Minor {
                 + ((i64::from(target - value) * i64::from(step) + i64::from(rate.dither_q16()))
                     >> 16) as i32
         };
-        let square = i32::from(squared_distance(x, self.mean) >> VARIANCE_GAINED);
+        let deviation = i32::from(self.deviation.max(DEVIATION_MIN));
+        // Half of the variance's change over the deviation is the deviation's.
+        let change = i32::from(distance(x, self.mean)).pow(2) - deviation.pow(2);
         self.mean = follow(i32::from(self.mean), i32::from(x)) as u16;
-        let variance = follow(i32::from(self.variance), square);
-        self.variance = variance.clamp(i32::from(VARIANCE_MIN >> VARIANCE_GAINED), 255) as u8;
+        let deviation = follow(deviation, deviation + change / (2 * deviation));
+        self.deviation = deviation.clamp(i32::from(DEVIATION_MIN), 255) as u8;
     }
 
     /// Eq. 4 and 14: the weight goes towards 1 or 0, less the prior.
@@ -258,11 +273,6 @@ impl Minor {
         };
         self.weight = weight.min(255) as u8;
     }
-}
-
-/// Squared distance to a mean, Q10, at most 64 grey levels squared.
-fn squared_distance(x: u16, mean: u16) -> u16 {
-    (x.abs_diff(mean) >> 2).min(255).pow(2)
 }
 
 impl Pixel {
@@ -282,7 +292,7 @@ impl Pixel {
 
     /// Learn observation `x`, whatever its class.
     pub fn learn(&mut self, x: u16, params: &Params) {
-        let near = |m: &Minor| m.weight > 0 && within(x, m.mean, m.variance_q10(), MATCH_Q8);
+        let near = |m: &Minor| m.weight > 0 && within(x, m.mean, m.variance(), MATCH_Q8);
         let main = within(x, self.mean, self.variance, MATCH_Q8);
         let minor = if main { None } else { self.minors.iter().position(near) };
         for (k, m) in self.minors.iter_mut().enumerate() {
@@ -298,15 +308,15 @@ impl Pixel {
 
     /// Eq. 5 and 6 for the main mode. Its weight is taken as one.
     fn follow(&mut self, x: u16, rate: &Rate) {
-        let square = squared_distance(x, self.mean);
+        let distance = distance(x, self.mean);
+        let square = distance * distance;
         let (shift, dither) = rate.shift(MEAN_GAINED);
-        let step = (distance(x, self.mean) * rate.mantissa + dither) >> shift;
+        let step = (distance * rate.mantissa + dither) >> shift;
         self.mean = if x > self.mean { self.mean + step } else { self.mean - step };
         let (shift, dither) = rate.shift(VARIANCE_GAINED);
-        let difference = square.abs_diff(self.variance) >> VARIANCE_GAINED;
-        let step = (difference * rate.mantissa + dither) >> shift;
+        let step = (part_of(square.abs_diff(self.variance), rate.mantissa) + dither) >> shift;
         self.variance = if square > self.variance {
-            self.variance.saturating_add(step)
+            self.variance + step
         } else {
             self.variance.saturating_sub(step).max(VARIANCE_MIN)
         };
@@ -331,10 +341,10 @@ impl Pixel {
         let main = self.main_weight();
         let heaviest = self.minors[0];
         if heaviest.weight > main {
-            let variance = (self.variance >> VARIANCE_GAINED) as u8;
-            self.minors[0] = Minor { mean: self.mean, variance, weight: main };
+            let deviation = self.variance.isqrt() as u8;
+            self.minors[0] = Minor { mean: self.mean, deviation, weight: main };
             self.mean = heaviest.mean;
-            self.variance = heaviest.variance_q10();
+            self.variance = heaviest.variance();
             if self.minors[1].weight > self.minors[0].weight {
                 self.minors.swap(0, 1);
             }
@@ -415,7 +425,7 @@ mod tests {
             update(observation(grey, Gain::ONE), &mut pixel, true, &params);
             if n >= 5000 {
                 mean += f64::from(pixel.mean) / 128.0 / 15_000.0;
-                variance += f64::from(pixel.variance) / 1024.0 / 15_000.0;
+                variance += f64::from(pixel.variance) / 64.0 / 15_000.0;
             }
         }
         // Averages over 15,000 frames: their own scatter is 0.03 grey levels and 2 %; 1/12 of

@@ -1,15 +1,17 @@
 //! Belt texture: taking it out of a row of the view, and matching two rows: the specification.
 //!
-//! Texture is in 1/16 grey level.
+//! Texture is in 1/16 grey level on a plain belt, in coarser units on one of strong texture.
 
 use super::mixture::{Gain, observation};
 
 /// Value of a pixel that shows no belt texture (foreground, not seen).
 pub const NO_TEXTURE: i8 = i8::MIN;
-/// Differences beyond 7 grey levels are shadows, dirt or parcels, not texture.
+/// Differences beyond this are shadows, dirt or parcels, not texture: 7 grey levels of 1/16.
 pub const TEXTURE_MAX: u16 = 112;
-/// A difference of Q7 is shifted by this.
-pub const TEXTURE_SHIFT: u32 = 3;
+/// A difference of Q7 is shifted by at least this: to 1/16 grey level.
+const SHIFT_MIN: u32 = 3;
+/// Texture reaches as far from the mean as this many standard deviations of the belt.
+const REACH_SIGMA: f64 = 3.0;
 /// Half width of the window whose mean is taken out of the texture.
 pub const SHADING_PX: usize = 16;
 /// Elements of the running sums of a row besides one a pixel.
@@ -18,11 +20,31 @@ pub const SUMS_BORDER: usize = 2 * SHADING_PX + 1;
 /// shorter than `2^COUNT_BITS`.
 pub const COUNT_BITS: u32 = 13;
 
+/// What the grey levels of a row are compared with.
+#[derive(Clone, Copy, Debug)]
+pub struct Belt<'a> {
+    /// Mean of each pixel, Q7.
+    pub mean: &'a [u16],
+    /// Light of this frame.
+    pub gain: Gain,
+    /// A difference of Q7 is shifted by this: see [`texture_shift`].
+    pub shift: u32,
+}
+
+/// Shift that lets the texture of a belt with this standard deviation fit into its 8 bits.
+pub fn texture_shift(belt_sigma_grey: f64) -> u32 {
+    let reach_grey = |shift: u32| f64::from(TEXTURE_MAX << shift) / 128.0;
+    (SHIFT_MIN..SHIFT_MIN + 4)
+        .find(|&shift| reach_grey(shift) >= REACH_SIGMA * belt_sigma_grey)
+        .unwrap_or(SHIFT_MIN + 4)
+}
+
 /// Texture of a row: grey levels less the belt's mean. `covered`: bit mask of what is not belt.
-pub fn extract(grey: &[u8], mean: &[u16], gain: Gain, covered: &[u64], out: &mut [i8]) {
+pub fn extract(grey: &[u8], belt: Belt<'_>, covered: &[u64], out: &mut [i8]) {
+    let Belt { mean, gain, shift } = belt;
     for (u, ((out, &grey), &mean)) in out.iter_mut().zip(grey).zip(mean).enumerate() {
         let x = observation(grey, gain);
-        let size = x.abs_diff(mean) >> TEXTURE_SHIFT;
+        let size = x.abs_diff(mean) >> shift;
         let is_belt = size <= TEXTURE_MAX && covered[u / 64] >> (u % 64) & 1 == 0;
         let signed = if x > mean { size as i16 } else { -(size as i16) };
         *out = if is_belt { signed as i8 } else { NO_TEXTURE };
@@ -139,8 +161,13 @@ mod tests {
     fn texture_is_the_difference_from_the_belt_where_it_is_small_and_free() {
         let mut out = [0; 4];
         let mean = [100 << 7; 4];
-        extract(&[101, 98, 110, 101], &mean, Gain::ONE, &[0b1000], &mut out);
+        let mut belt = Belt { mean: &mean, gain: Gain::ONE, shift: texture_shift(1.3) };
+        extract(&[101, 98, 110, 101], belt, &[0b1000], &mut out);
         assert_eq!(out, [16, -32, NO_TEXTURE, NO_TEXTURE]);
+        // A woven belt: the same difference is texture, in units twice as coarse.
+        belt.shift = texture_shift(4.5);
+        extract(&[101, 98, 110, 101], belt, &[0b1000], &mut out);
+        assert_eq!(out, [8, -16, 80, NO_TEXTURE]);
     }
 
     #[test]

@@ -6,7 +6,7 @@
 //! each in a block that has a pixel with a second mode.
 
 use crate::kernel::scalar::mixture::{
-    Gain, MATCH_Q8, MEAN_GAINED, MINORS, Minor, PRIOR, Params, Pixel, SHADOW_MEAN_MIN,
+    Gain, MATCH_Q8, MEAN_GAINED, MINORS, Minor, PRIOR, Params, Pixel, REACH_MAX, SHADOW_MEAN_MIN,
     VARIANCE_GAINED, VARIANCE_MIN, observation,
 };
 use fearless_simd::{Level, dispatch, prelude::*};
@@ -22,7 +22,7 @@ pub const BLOCK: usize = 64;
 pub struct Model<'a> {
     /// Means of the main mode, Q7.
     pub mean: &'a mut [u16],
-    /// Variances of the main mode, Q10.
+    /// Variances of the main mode, Q6.
     pub variance: &'a mut [u16],
     /// Weaker modes, the heavier first.
     pub minors: [Minors<'a>; MINORS],
@@ -35,28 +35,28 @@ pub struct Model<'a> {
 pub struct Minors<'a> {
     /// Means, Q7.
     pub mean: &'a mut [u16],
-    /// Variances, Q2.
-    pub variance: &'a mut [u8],
+    /// Standard deviations, Q3.
+    pub deviation: &'a mut [u8],
     /// Weights, 1/255; 0: no mode.
     pub weight: &'a mut [u8],
 }
 
 impl Minors<'_> {
     fn get(&self, i: usize) -> Minor {
-        Minor { mean: self.mean[i], variance: self.variance[i], weight: self.weight[i] }
+        Minor { mean: self.mean[i], deviation: self.deviation[i], weight: self.weight[i] }
     }
 
     fn block(&self, pixels: &std::ops::Range<usize>) -> MinorBlock<'_> {
         MinorBlock {
             mean: &self.mean[pixels.clone()],
-            variance: &self.variance[pixels.clone()],
+            deviation: &self.deviation[pixels.clone()],
             weight: &self.weight[pixels.clone()],
         }
     }
 
     fn set(&mut self, i: usize, minor: Minor) {
         self.mean[i] = minor.mean;
-        self.variance[i] = minor.variance;
+        self.deviation[i] = minor.deviation;
         self.weight[i] = minor.weight;
     }
 }
@@ -246,8 +246,16 @@ pub(super) fn brighten<S: Simd>(grey: S::u16s, gain: Gain) -> S::u16s {
 }
 
 #[inline(always)]
-fn part_of<S: Simd>(mean: S::u16s, ratio_q8: u16) -> S::u16s {
-    (mean >> 8) * ratio_q8 + (((mean & 255) * ratio_q8) >> 8)
+fn part_of<S: Simd>(value: S::u16s, ratio_q8: u16) -> S::u16s {
+    (value >> 8) * ratio_q8 + (((value & 255) * ratio_q8) >> 8)
+}
+
+/// Square of a distance over the reach, `halves` times halved before.
+#[inline(always)]
+fn reach<S: Simd>(distance: S::u16s, reach_q8: u16, halves: u32) -> S::u16s {
+    let deviation = (part_of::<S>(distance, reach_q8) >> (2 + halves)).min(REACH_MAX);
+    let (whole, quarters) = (deviation >> 2, deviation & 3);
+    whole * whole + ((((whole * quarters) << 3) + quarters * quarters) >> 4)
 }
 
 #[inline(always)]
@@ -279,21 +287,19 @@ fn follow<S: Simd, const ALL: bool>(
             let v = S::u16s::from_slice(simd, &variance[at..at + n]);
             let difference = abs_diff::<S>(x, m);
             let distance = (difference >> 4).min(255);
-            let reach = ((distance * params.reach_q8) >> 6).min(255);
-            all_within |= (reach * reach).simd_lt(v).to_bitmask() << at;
-            let reach = ((distance * MATCH_Q8) >> 6).min(255);
-            let near = (reach * reach).simd_lt(v);
+            let within = reach::<S>(difference, params.reach_q8, 0).simd_lt(v);
+            all_within |= within.to_bitmask() << at;
+            let near = reach::<S>(difference, MATCH_Q8, 0).simd_lt(v);
             all_near |= near.to_bitmask() << at;
             let moves = if ALL { near } else { near & S::mask16s::from_bitmask(simd, learn >> at) };
             let step = (distance * mantissa + mean_dither) >> mean_shift;
             let moved = x.simd_gt(m).select(m + step, m - step);
             moves.select(moved, m).store_slice(&mut mean[at..at + n]);
-            let root = (difference >> 2).min(255);
-            let square = root * root;
-            let step = (abs_diff::<S>(square, v) >> VARIANCE_GAINED) * mantissa + variance_dither;
+            let square = distance * distance;
+            let step = part_of::<S>(abs_diff::<S>(square, v), mantissa) + variance_dither;
             let step = step >> variance_shift;
             let shrunk = v.saturating_sub(step).max(VARIANCE_MIN);
-            let moved = square.simd_gt(v).select(v.saturating_add(step), shrunk);
+            let moved = square.simd_gt(v).select(v + step, shrunk);
             moves.select(moved, v).store_slice(&mut variance[at..at + n]);
         }
     }
@@ -327,11 +333,10 @@ fn main_shade<S: Simd>(
             let m = S::u16s::from_slice(simd, &mean[at..at + n]);
             let v = S::u16s::from_slice(simd, &variance[at..at + n]);
             let (shadow, dark) = darker::<S>(x, m, params);
-            let distance = (abs_diff::<S>(x, m) >> 4).min(255);
-            let half_reach = ((distance * params.reach_q8) >> 6).min(255) >> 1;
+            let strong = reach::<S>(abs_diff::<S>(x, m), params.reach_q8, 1).simd_ge(v);
             shade.shadow |= shadow.to_bitmask() << at;
             shade.dark |= dark.to_bitmask() << at;
-            shade.strong |= (half_reach * half_reach).simd_ge(v).to_bitmask() << at;
+            shade.strong |= strong.to_bitmask() << at;
         }
     }
     shade
@@ -340,7 +345,7 @@ fn main_shade<S: Simd>(
 /// A weaker mode of a block.
 struct MinorBlock<'a> {
     mean: &'a [u16],
-    variance: &'a [u8],
+    deviation: &'a [u8],
     weight: &'a [u8],
 }
 
@@ -369,13 +374,13 @@ fn add_minor_shades<S: Simd>(
             let exists = weights[k].simd_gt(0) & shares[k].simd_lt(params.background_share);
             // Without one mode there is none after it.
             counts &= exists.to_bitmask();
-            let (low, high) = S::u8s::from_slice(simd, &minors[k].variance[bytes.clone()]).widen();
-            for (half, v) in [low, high].into_iter().enumerate() {
+            let (low, high) = S::u8s::from_slice(simd, &minors[k].deviation[bytes.clone()]).widen();
+            for (half, deviation) in [low, high].into_iter().enumerate() {
                 let (x, at) = (seen[half], at + half * n);
                 let m = S::u16s::from_slice(simd, &minors[k].mean[at..at + n]);
-                let distance = (abs_diff::<S>(x, m) >> 4).min(255);
-                let reach = ((distance * params.reach_q8) >> 6).min(255);
-                let within = (reach * reach).simd_lt(v << VARIANCE_GAINED);
+                let distance = abs_diff::<S>(x, m);
+                let within =
+                    reach::<S>(distance, params.reach_q8, 0).simd_lt(deviation * deviation);
                 let (shadow, dark) = darker::<S>(x, m, params);
                 let counts = counts >> (half * n);
                 shade.background |= (within.to_bitmask() & counts) << at;
@@ -435,9 +440,9 @@ mod tests {
             let mut model = Model {
                 mean: &mut mean,
                 variance: &mut variance,
-                minors: minors.each_mut().map(|(mean, variance, weight)| Minors {
+                minors: minors.each_mut().map(|(mean, deviation, weight)| Minors {
                     mean,
-                    variance,
+                    deviation,
                     weight,
                 }),
                 multiple: &mut multiple,
@@ -463,7 +468,7 @@ mod tests {
                     variance: variance[i],
                     minors: minors.map(|m| Minor {
                         mean: m.0[i],
-                        variance: m.1[i],
+                        deviation: m.1[i],
                         weight: m.2[i],
                     }),
                 };

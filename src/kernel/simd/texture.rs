@@ -1,9 +1,8 @@
 //! [`crate::kernel::scalar::texture`] in vectors.
 
 use super::mixture::brighten;
-use crate::kernel::scalar::mixture::Gain;
 use crate::kernel::scalar::texture::{
-    COUNT_BITS, NO_TEXTURE, SUMS_BORDER, Sums, TEXTURE_MAX, TEXTURE_SHIFT, overlap, running_sums,
+    Belt, COUNT_BITS, NO_TEXTURE, SUMS_BORDER, Sums, TEXTURE_MAX, overlap, running_sums,
 };
 use fearless_simd::{Level, dispatch, prelude::*};
 
@@ -15,13 +14,13 @@ const STRETCH: usize = 1 << 15;
 pub fn extract(
     level: Level,
     grey: &[u8],
-    (mean, gain): (&[u16], Gain),
+    belt: Belt<'_>,
     covered: &[u64],
     sums: &mut [i32],
     out: &mut [i8],
 ) {
     dispatch!(level, simd => {
-        differences(simd, grey, (mean, gain), covered, out);
+        differences(simd, grey, belt, covered, out);
         running_sums(out, sums);
         remove_shading(out, sums);
     });
@@ -31,7 +30,7 @@ pub fn extract(
 fn differences<S: Simd>(
     simd: S,
     grey: &[u8],
-    (mean, gain): (&[u16], Gain),
+    Belt { mean, gain, shift }: Belt<'_>,
     covered: &[u64],
     out: &mut [i8],
 ) {
@@ -42,8 +41,8 @@ fn differences<S: Simd>(
         let low_mean = S::u16s::from_slice(simd, &mean[at..at + n]);
         let high_mean = S::u16s::from_slice(simd, &mean[at + n..at + 2 * n]);
         let covered = covered[at / 64] >> (at % 64);
-        let low = difference::<S>(simd, brighten::<S>(low, gain), low_mean, covered);
-        let high = difference::<S>(simd, brighten::<S>(high, gain), high_mean, covered >> n);
+        let low = difference::<S>(simd, brighten::<S>(low, gain), low_mean, shift, covered);
+        let high = difference::<S>(simd, brighten::<S>(high, gain), high_mean, shift, covered >> n);
         let bytes: S::u8s = low.narrow(high);
         for (out, &byte) in out.iter_mut().zip(bytes.as_slice()) {
             *out = byte as i8;
@@ -52,8 +51,8 @@ fn differences<S: Simd>(
 }
 
 #[inline(always)]
-fn difference<S: Simd>(simd: S, x: S::u16s, mean: S::u16s, covered: u64) -> S::u16s {
-    let size = (x.max(mean) - x.min(mean)) >> TEXTURE_SHIFT;
+fn difference<S: Simd>(simd: S, x: S::u16s, mean: S::u16s, shift: u32, covered: u64) -> S::u16s {
+    let size = (x.max(mean) - x.min(mean)) >> shift;
     let is_belt = size.simd_le(TEXTURE_MAX) & !S::mask16s::from_bitmask(simd, covered);
     let signed = x.simd_gt(mean).select(size, !size + 1);
     is_belt.select(signed, S::u16s::splat(simd, NO_TEXTURE as u16))
@@ -101,6 +100,7 @@ fn products(key: &[i8], current: &[i8], sums: &mut Sums) {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::kernel::scalar::mixture::Gain;
     use crate::kernel::scalar::texture as scalar;
     use crate::kernel::simd::each_level;
 
@@ -128,14 +128,15 @@ mod tests {
             let covered: [u64; N / 64] =
                 std::array::from_fn(|_| if case % 3 == 0 { 0 } else { cover() << 13 ^ cover() });
             let gain = Gain::from_q15(30000 + 200 * case);
+            let belt = Belt { mean: &mean, gain, shift: 3 + case % 5 };
             let mut expected = [0; N];
             let mut sums = [0; N + SUMS_BORDER];
-            scalar::extract(&greys, &mean, gain, &covered, &mut expected);
+            scalar::extract(&greys, belt, &covered, &mut expected);
             running_sums(&expected, &mut sums);
             scalar::remove_shading(&mut expected, &sums);
             each_level(|level| {
                 let (mut out, mut sums) = ([0x5a; N], [-1; N + SUMS_BORDER]);
-                extract(level, &greys, (&mean, gain), &covered, &mut sums, &mut out);
+                extract(level, &greys, belt, &covered, &mut sums, &mut out);
                 assert!(out == expected, "{level:?} case {case}");
             });
         }

@@ -6,10 +6,15 @@
 //! background or a hand does not. Neighbours that perspective or a shadow shows as one blob become
 //! two tracks once they have been seen apart.
 
+mod state;
+
+pub use state::{Phase, Track};
+
 use super::segment::{Blob, PxBox};
 use crate::belt::BeltPosition;
 use crate::error::Result;
 use crate::plan::{Block, Memory, Plan};
+use state::FREE;
 
 /// Overlap over union of a blob and a track's prediction that makes the blob the track's.
 const SAME_MIN: f32 = 0.2;
@@ -29,8 +34,6 @@ const YOUNG_FRAMES: u32 = 8;
 
 /// A smaller track inside a larger one's blob for this many frames is a piece of it.
 const FRAGMENT_FRAMES: u32 = 8;
-/// Fewer shared frames than this do not harm a pass.
-const MERGED_FRAMES: u32 = 3;
 /// The end of several pieces follows the belt by at least the rest of this share.
 const LAG_SHARE: f32 = 0.5;
 /// A track with several large blobs over this travel, px, is several parcels, ...
@@ -49,73 +52,6 @@ const INSIDE_SHARE: f32 = 0.8;
 
 /// No owner.
 pub const NOBODY: u16 = u16::MAX;
-
-/// Where a track is in its life.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub enum Phase {
-    /// The slot is empty.
-    Free,
-    /// Seen, but not yet known to ride on the belt.
-    Candidate,
-    /// A parcel on its way through the zone.
-    Riding,
-    /// Reported; followed until it is out of view, so that it is not found again.
-    Left,
-}
-
-/// One parcel candidate.
-#[derive(Clone, Copy, Debug)]
-pub struct Track {
-    /// Life phase.
-    pub phase: Phase,
-    /// Box of its blobs, or the prediction while unseen.
-    pub bounds: PxBox,
-    /// Belt position when first seen.
-    pub first: BeltPosition,
-    /// Frames it has been followed.
-    pub frames: u32,
-    /// It shares its blob with another track in this frame.
-    pub merged: bool,
-    /// Frames in which it did, other than with pieces of itself.
-    merged_frames: u32,
-    /// Frames on end that it has been inside a larger track's blob.
-    inside_frames: u32,
-    /// Travel, px, since it was last seen.
-    unseen_px: f64,
-    /// Travel, px, over which its blobs were several parcels'.
-    split_px: f64,
-    first_bounds: PxBox,
-}
-
-const FREE: Track = Track {
-    phase: Phase::Free,
-    bounds: PxBox { u0: 0.0, u1: 0.0, v0: 0.0, v1: 0.0 },
-    first: BeltPosition { travel_mm: 0.0, measured_mm: 0.0 },
-    frames: 0,
-    merged: false,
-    merged_frames: 0,
-    inside_frames: 0,
-    unseen_px: 0.0,
-    split_px: 0.0,
-    first_bounds: PxBox { u0: 0.0, u1: 0.0, v0: 0.0, v1: 0.0 },
-};
-
-impl Track {
-    /// Whether the track holds the background under it.
-    pub fn is_parcel(&self) -> bool {
-        matches!(self.phase, Phase::Riding | Phase::Left)
-    }
-
-    /// Whether it ran together with another parcel for long enough to matter.
-    pub fn was_merged(&self) -> bool {
-        self.merged_frames >= MERGED_FRAMES
-    }
-
-    /// How far the blob's ends have moved, px: the better of both, as one end may be clipped.
-    fn followed_px(&self) -> f32 {
-        (self.bounds.u0 - self.first_bounds.u0).max(self.bounds.u1 - self.first_bounds.u1)
-    }
-}
 
 /// What happened to a track in a frame.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -186,7 +122,7 @@ impl Tracker {
         for slot in 0..self.tracks.len() {
             let owns = |b: &Blob| self.owners[b.label as usize] == slot as u16;
             if self.tracks[slot].phase != Phase::Free && !blobs.iter().any(owns) {
-                self.share(slot, blobs, covers);
+                self.share(slot, blobs, step_px, covers);
             } else {
                 self.tracks[slot].inside_frames = 0;
             }
@@ -238,6 +174,7 @@ impl Tracker {
         &mut self,
         slot: usize,
         blobs: &[Blob],
+        step_px: f64,
         covers: &dyn Fn(usize, &PxBox) -> Option<bool>,
     ) {
         let bounds = self.tracks[slot].bounds;
@@ -253,7 +190,7 @@ impl Tracker {
         let whole = self.tracks[owner].bounds.union(&blob.bounds);
         let was_apart = covers(slot, &bounds).is_some()
             && bounds.area() >= APART_SHARE * whole.area()
-            && self.tracks[slot].followed_px() >= APART_TRAVEL_PX;
+            && self.tracks[slot].followed_px(step_px >= 0.0) >= APART_TRAVEL_PX;
         let inside = covers(owner, &bounds) == Some(true)
             || !was_apart && whole.overlap(&bounds) >= INSIDE_SHARE * bounds.area();
         let track = &mut self.tracks[slot];
@@ -355,7 +292,9 @@ impl Tracker {
             let travel_px = (at.travel_mm - track.first.travel_mm) / self.mm_per_px;
             match track.phase {
                 Phase::Candidate => {
-                    let follows = track.followed_px() >= CONFIRM_SHARE * travel_px as f32;
+                    let followed_px = track.followed_px(travel_px >= 0.0);
+                    let travel_px = travel_px.abs();
+                    let follows = followed_px >= CONFIRM_SHARE * travel_px as f32;
                     if travel_px >= CONFIRM_TRAVEL_PX && follows && track.unseen_px == 0.0 {
                         track.phase = Phase::Riding;
                     } else if travel_px > GIVE_UP_TRAVEL_PX || track.unseen_px > CONFIRM_TRAVEL_PX {

@@ -1,0 +1,271 @@
+//! Belts as they are: woven, plain, seen by a noisy camera. What passes on them is told, once.
+
+mod common;
+
+use beltgauge::config::{Config, Site};
+use beltgauge::event::{Flags, ParcelRecord};
+use beltgauge::image::{FrameTime, Plane};
+use beltgauge::pipeline::Pipeline;
+use beltgauge::source::FrameSource;
+use beltgauge::source::synthetic::{Scenario, Synthetic};
+use beltgauge::stage::odometry::Knowledge;
+use common::measure_scenario;
+use std::fmt::Write as _;
+
+/// A 640 x 400 camera 1 m above the belt, 2 mm a pixel, straight down.
+const CAMERA: &str = r#"
+[camera]
+image_size_px = [640, 400]
+[camera.lens]
+model = "brown"
+fx_px = 512.0
+fy_px = 512.0
+cx_px = 319.5
+cy_px = 199.5
+distortion = [0.0, 0.0, 0.0, 0.0, 0.0]
+[camera.pose]
+rotation = [[1.0, 0.0, 0.0], [0.0, -1.0, 0.0], [0.0, 0.0, -1.0]]
+translation_mm = [0.0, 0.0, 1000.0]
+"#;
+
+const SIZE_MM: [f64; 3] = [200.0, 120.0, 80.0];
+const SPEED_MM_PER_S: f64 = 500.0;
+
+/// Boxes half a metre apart, on a belt of this texture, with `tables` besides.
+fn boxes(count: usize, grey: f64, texture_grey: f64, tables: &str) -> Scenario {
+    belt(&vec![(SIZE_MM, 8.0); count], grey, texture_grey, tables)
+}
+
+/// Parcels, size and yaw in degrees, half a metre apart.
+fn belt(parcels: &[([f64; 3], f64)], grey: f64, texture_grey: f64, tables: &str) -> Scenario {
+    let frames = 105 + 30 * parcels.len();
+    let mut text = format!(
+        "seed = 3\nfps = 30\nframes = {frames}\nexposure_ms = 1\n{CAMERA}\
+         [belt]\nspeed_mm_per_s = {SPEED_MM_PER_S}\nwidth_mm = 800\ngrey = {grey}\n\
+         texture_grey = {texture_grey}\n{tables}\n"
+    );
+    for (k, ([l, w, h], yaw_deg)) in parcels.iter().enumerate() {
+        let x_mm = -1000.0 - 500.0 * k as f64;
+        let _ = writeln!(
+            text,
+            "[[parcel]]\nlength_mm = {l}\nwidth_mm = {w}\nheight_mm = {h}\nyaw_deg = {yaw_deg}\n\
+             x_mm = {x_mm}\ny_mm = 20\nmaterial = \"white\""
+        );
+    }
+    Scenario::parse(&text).expect("a valid scenario")
+}
+
+fn site(scenario: &Scenario, nominal_mm_per_s: f64) -> Site {
+    let config = format!(
+        "[camera]\ncalibration = \"the scenario's\"\n\
+         [zone]\nx_min_mm = -500\nx_max_mm = 500\ny_min_mm = -300\ny_max_mm = 300\n\
+         [belt]\nspeed_mm_per_s = {nominal_mm_per_s}\n"
+    );
+    let camera = scenario.camera().expect("a valid camera");
+    Site::new(Config::parse(&config).expect("valid"), camera).expect("a zone in view")
+}
+
+fn is_right(record: &ParcelRecord) -> bool {
+    let sides_mm = [record.length_mm, record.width_mm, record.height_mm];
+    sides_mm.iter().zip(SIZE_MM).all(|(side, truth)| (side - truth).abs() <= 2.0)
+}
+
+#[test]
+fn boxes_on_a_woven_belt_are_measured() {
+    for (grey, texture_grey) in [(60.0, 4.5), (70.0, 8.0), (80.0, 12.0)] {
+        let scenario = boxes(2, grey, texture_grey, "");
+        let records = measure_scenario(&scenario, site(&scenario, 490.0));
+        assert!(
+            records.len() == 2 && records.iter().all(|r| is_right(r) && r.may_be_used),
+            "{texture_grey}: {records:#?}"
+        );
+    }
+}
+
+/// Records and pipeline after a scenario whose frames and times `change` may alter.
+fn run(
+    scenario: &Scenario,
+    site: Site,
+    mut change: impl FnMut(&mut Pipeline, &mut [u8], &mut FrameTime),
+) -> (Vec<ParcelRecord>, Pipeline) {
+    let mut source = Synthetic::new(scenario.clone()).expect("renders");
+    let (mut frames, mut pipeline) = beltgauge::run::build(site).expect("fits");
+    let mut frame = frames.pop().expect("planned");
+    let mut records = Vec::new();
+    while let Some(mut time) = source.next_into(&mut frame).expect("renders") {
+        change(&mut pipeline, &mut frame, &mut time);
+        let raw = Plane::packed(&frame, 640, 400).expect("this size");
+        pipeline.step(raw, time, &mut |r| records.push(r)).expect("this size");
+    }
+    pipeline.finish(&mut |r| records.push(r));
+    (records, pipeline)
+}
+
+/// Each record is right or says that it may not be used.
+fn assert_honest(records: &[ParcelRecord], count: usize) {
+    assert!(
+        records.len() == count && records.iter().all(|r| is_right(r) || !r.may_be_used),
+        "{records:#?}"
+    );
+}
+
+#[test]
+fn a_plain_belt_frozen_by_compression_does_not_stand() {
+    let scenario = boxes(3, 60.0, 0.0, "");
+    let mut last: Option<Vec<u8>> = None;
+    let mut stood = 0;
+    let (records, _) = run(&scenario, site(&scenario, 500.0), |pipeline, frame, _| {
+        let (speed, measured) = pipeline.belt_motion();
+        stood += u32::from(measured && speed.abs() < 0.5 * SPEED_MM_PER_S);
+        // What differs by noise only is repeated, as encoders do.
+        if let Some(last) = &last {
+            for (new, &old) in frame.iter_mut().zip(last) {
+                *new = if new.abs_diff(old) < 8 { old } else { *new };
+            }
+        }
+        last = Some(frame.to_vec());
+    });
+    assert_eq!(stood, 0, "frames in which a standstill was measured");
+    assert_honest(&records, 3);
+}
+
+/// Draws ribs across the belt, `period_mm` apart, that ride on it.
+fn ribs(frame: &mut [u8], grey: f64, period_mm: f64, travel_mm: f64) {
+    for row in frame.chunks_exact_mut(640) {
+        for (u, pixel) in row.iter_mut().enumerate() {
+            let x_mm = (u as f64 - 319.5) * 1000.0 / 512.0 - travel_mm;
+            let rib = 5.0 * (std::f64::consts::TAU * x_mm / period_mm).sin();
+            if (f64::from(*pixel) - grey).abs() < 9.0 {
+                *pixel = (f64::from(*pixel) + rib) as u8;
+            }
+        }
+    }
+}
+
+#[test]
+fn a_belt_with_ribs_is_never_silently_wrong_running_or_stopped() {
+    let stop = "[[belt.stop]]\nat_s = 3.2\nfor_s = 1.0\nramp_s = 0.2\n";
+    for (period_mm, stop) in [(7.0, ""), (18.5, stop), (30.0, ""), (60.0, stop)] {
+        let mut scenario = boxes(2, 60.0, 0.0, stop);
+        scenario.frames += 40;
+        let (records, pipeline) = run(&scenario, site(&scenario, 500.0), |_, frame, time| {
+            ribs(frame, 60.0, period_mm, scenario.travel_at_frame_mm(time.index));
+        });
+        assert_honest(&records, 2);
+        let known = pipeline.health().texture == Knowledge::Measured;
+        assert_eq!(known, period_mm > 40.0, "{period_mm} mm: {:?}", pipeline.health());
+    }
+}
+
+#[test]
+fn a_speed_far_from_the_nominal_one_is_found_and_said() {
+    let scenario = boxes(2, 60.0, 2.0, "");
+    for nominal_mm_per_s in [200.0, 1100.0] {
+        let (records, pipeline) = run(&scenario, site(&scenario, nominal_mm_per_s), |_, _, _| {});
+        assert!(records.len() == 2 && records.iter().all(is_right), "{records:#?}");
+        let health = pipeline.health();
+        let seen = health.belt_seen_mm_per_s.expect("seen");
+        assert!((seen / SPEED_MM_PER_S - 1.0).abs() < 0.01 && health.belt_not_as_configured);
+    }
+}
+
+#[test]
+fn a_belt_that_runs_backwards_is_said_and_its_parcels_are_told() {
+    let scenario = boxes(2, 60.0, 2.0, "");
+    let (records, pipeline) = run(&scenario, site(&scenario, 500.0), |_, frame, _| {
+        frame.chunks_exact_mut(640).for_each(<[u8]>::reverse);
+    });
+    assert!(records.len() == 2 && records.iter().all(|r| !r.may_be_used), "{records:#?}");
+    let health = pipeline.health();
+    assert!(health.belt_seen_mm_per_s.is_some_and(|seen| seen < -450.0), "{health:?}");
+    assert!(health.belt_not_as_configured);
+}
+
+#[test]
+fn over_a_gap_that_the_view_cannot_bridge_nothing_is_lost_silently() {
+    let scenario = boxes(3, 60.0, 2.0, "");
+    // The first box is in the middle, the second about to come, the third far.
+    for jump_s in [4.0 * 3600.0, -100.0, f64::NAN, f64::INFINITY] {
+        let began = std::time::Instant::now();
+        let (records, _) = run(&scenario, site(&scenario, 500.0), |_, _, time| {
+            time.t_s += if time.index == 60 || time.index > 60 && jump_s.is_finite() {
+                jump_s
+            } else {
+                0.0
+            };
+        });
+        assert!(began.elapsed().as_secs() < 60, "a step's cost follows the time stamps");
+        // The one inside is told, and again when it goes on: nobody knows that it is the same.
+        assert!((3..=4).contains(&records.len()), "{jump_s}: {records:#?}");
+        assert!(records[0].flags.has(Flags::LOST) && !records[0].may_be_used);
+        assert!(records.iter().all(|r| is_right(r) || !r.may_be_used), "{records:#?}");
+        let seq: Vec<u32> = records.iter().map(|r| r.seq).collect();
+        assert!(seq.iter().zip(1..).all(|(&seq, n)| seq == n), "{seq:?}");
+        assert!(records.last().is_some_and(|r| is_right(r) && r.may_be_used), "{records:#?}");
+    }
+}
+
+#[test]
+fn an_encoder_that_shows_another_travel_than_the_belt_is_found_out() {
+    let scenario = boxes(6, 60.0, 2.0, "");
+    for ratio in [1.01, 0.98, 0.0] {
+        let (records, pipeline) = run(&scenario, site(&scenario, 500.0), |pipeline, _, time| {
+            pipeline.encoder(ratio * scenario.travel_at_frame_mm(time.index));
+        });
+        assert_honest(&records, 6);
+        assert!(records[2..].iter().all(|r| is_right(r) && r.may_be_used), "{records:#?}");
+        let health = pipeline.health();
+        let (found, sigma) = health.encoder_ratio.expect("compared");
+        assert!(health.encoder_disagrees && (found - ratio).abs() < 0.002, "{found} +- {sigma}");
+    }
+}
+
+/// Boxes of random size on random belts, of whose frames a random share is missing.
+fn with_frames_dropped(belts: std::ops::Range<u64>) {
+    let mut wrong = String::new();
+    for seed in belts {
+        let mut state = seed.wrapping_mul(0x9e37_79b9_7f4a_7c15) | 1;
+        let mut random = move || {
+            state ^= state << 13;
+            state ^= state >> 7;
+            state ^= state << 17;
+            (state >> 40) as f64 / f64::from(1 << 24)
+        };
+        let share = 0.6 * random();
+        let mut parcel = || {
+            let [w, h, yaw] = [100.0 * random(), 200.0 * random(), 180.0 * random()];
+            ([200.0, 60.0 + w, 20.0 + h], yaw)
+        };
+        let parcels = [parcel(), parcel()];
+        let mut scenario = belt(&parcels, 60.0, 2.0, "");
+        scenario.frames += 20;
+        let mut source = Synthetic::new(scenario.clone()).expect("renders");
+        let (mut frames, mut pipeline) =
+            beltgauge::run::build(site(&scenario, 500.0)).expect("fits");
+        let mut frame = frames.pop().expect("planned");
+        let mut records = Vec::new();
+        while let Some(time) = source.next_into(&mut frame).expect("renders") {
+            if time.index > 20 && random() < share {
+                continue;
+            }
+            let raw = Plane::packed(&frame, 640, 400).expect("this size");
+            pipeline.step(raw, time, &mut |r| records.push(r)).expect("this size");
+        }
+        pipeline.finish(&mut |r| records.push(r));
+        if records.len() != 2 {
+            let _ = writeln!(wrong, "belt {seed}, {share:.2} dropped: {records:#?}");
+        }
+    }
+    assert!(wrong.is_empty(), "{wrong}");
+}
+
+#[test]
+fn with_frames_dropped_at_random_every_parcel_is_told_once() {
+    with_frames_dropped(0..20);
+}
+
+#[test]
+#[ignore = "minutes"]
+fn with_frames_dropped_on_many_belts_every_parcel_is_told_once() {
+    with_frames_dropped(20..220);
+}
