@@ -10,6 +10,7 @@ use beltgauge::run::calibrate::{self, DataSheet};
 use beltgauge::run::offline::{self, Observer, Outputs};
 use beltgauge::run::outputs::refuse_inputs;
 use beltgauge::run::{demo, import, live, log, privileges, update};
+use beltgauge::source::{FaultInjector, Faults};
 use beltgauge::store::{Store, manifest};
 use beltgauge::{run, sandbox, source};
 use clap::{Parser, Subcommand};
@@ -82,6 +83,9 @@ enum Command {
         /// Write annotated pictures to this folder.
         #[arg(long)]
         annotate: Option<PathBuf>,
+        /// Spoil the input: drop=SHARE,double=SHARE,late=MS,noise=GREY,seed=N, any of them.
+        #[arg(long)]
+        inject: Option<String>,
     },
     /// Calibrate the camera: first its lens, then its place over the belt.
     #[command(subcommand)]
@@ -328,12 +332,17 @@ fn dispatch(command: Command) -> Result<()> {
             let table = demo::run(demo::Options { seconds, out: &out, listen, config })?;
             print(format_args!("{table}\npictures and records are in {}", out.display()))
         }
-        Command::Measure { input, config, fps, jsonl, annotate } => {
+        Command::Measure { input, config, fps, jsonl, annotate, inject } => {
             let site = Site::load(&config)?;
             let outputs = Outputs { jsonl: jsonl.as_deref(), annotate: annotate.as_deref() };
             let camera = config.with_file_name(&site.config.camera.calibration);
             outputs.refuse_inputs(&[&input, &config, &camera])?;
+            let faults = inject.as_deref().map(Faults::parse).transpose()?;
             let source = source::open(&input, fps)?;
+            let source: Box<dyn source::FrameSource> = match faults {
+                Some(faults) => Box::new(FaultInjector::new(source, faults)),
+                None => source,
+            };
             print(format_args!("{}", ParcelRecord::TABLE_HEADER))?;
             let counters = offline::measure(source, site, outputs, &mut Console)?;
             print(format_args!("{counters}"))

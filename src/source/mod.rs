@@ -3,6 +3,7 @@
 #[cfg(feature = "aravis")]
 mod aravis;
 mod directory;
+mod fault_injector;
 mod feed;
 mod gige;
 mod pixels;
@@ -14,6 +15,7 @@ mod v4l2;
 mod y4m;
 
 pub use directory::Directory;
+pub use fault_injector::{FaultInjector, Faults};
 pub use feed::{Arrival, Driver, Feed, FeedStatus, Live, Next, Pace, Paced, Taken};
 pub use still::{Still, stills_in};
 pub use y4m::Y4m;

@@ -3,14 +3,20 @@
 //! A [`Scenario`] (TOML) is the only source of truth. [`Renderer`] makes clean frames in 1/256
 //! grey level; [`noise`] is a separate step. Serves demo, tests and benchmarks.
 
+mod belt;
+mod lamps;
 pub mod noise;
 mod random;
 mod render;
 mod scenario;
+mod sensor;
+mod solid;
 
 pub use random::Random;
 pub use render::Renderer;
 pub use scenario::{Material, Parcel, Scenario};
+
+use sensor::Sensor;
 
 use super::FrameSource;
 use crate::camera::BeltView;
@@ -21,6 +27,7 @@ use crate::image::FrameTime;
 pub struct Synthetic {
     renderer: Renderer,
     noise: noise::Noise,
+    sensor: Sensor,
     clean: Vec<u16>,
     next_index: u64,
 }
@@ -31,7 +38,9 @@ impl Synthetic {
         let noise = noise::Noise::new(scenario.seed, &scenario.noise);
         let renderer = Renderer::new(scenario)?;
         let [width, height] = renderer.camera().image_size_px;
-        Ok(Self { renderer, noise, clean: vec![0; width * height], next_index: 0 })
+        let (seed, table) = (renderer.scenario().seed, &renderer.scenario().sensor);
+        let sensor = Sensor::new(table, seed, [width, height]);
+        Ok(Self { renderer, noise, sensor, clean: vec![0; width * height], next_index: 0 })
     }
 
     /// The scenario rendered.
@@ -44,10 +53,12 @@ impl Synthetic {
         self.renderer.parcel_mask(index, view, mask);
     }
 
-    /// Render frame `index`, with its noise.
+    /// Render frame `index`, with its noise. A noise reduction in the scenario needs them in order.
     pub fn render(&mut self, index: u64, frame: &mut [u8]) {
         self.renderer.render(index, &mut self.clean);
+        self.sensor.expose(index, &mut self.clean);
         self.noise.apply(index, &self.clean, self.renderer.camera().image_size_px[0], frame);
+        self.sensor.process(index, frame);
     }
 }
 
@@ -72,5 +83,29 @@ impl FrameSource for Synthetic {
 
     fn skip(&mut self, count: u64) {
         self.next_index += count;
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// FNV-1a. Source: Fowler, Noll and Vo 1991.
+    fn hash(bytes: &[u8]) -> u64 {
+        bytes
+            .iter()
+            .fold(0xcbf2_9ce4_8422_2325, |h, &b| (h ^ u64::from(b)).wrapping_mul(0x0100_0000_01b3))
+    }
+
+    #[test]
+    fn a_scenario_without_lamps_looks_as_it_always_did() {
+        let text = include_str!("../../../config/demo/scenario.toml");
+        let mut source = Synthetic::new(Scenario::parse(text).expect("valid")).expect("renders");
+        let mut frame = vec![0; 1280 * 800];
+        let hashes = [90, 150].map(|index| {
+            source.render(index, &mut frame);
+            hash(&frame)
+        });
+        assert_eq!(hashes, [579_411_251_160_323_890, 6_585_253_849_508_366_193]);
     }
 }

@@ -5,16 +5,15 @@
 //! motion blur at once; plain surfaces are sampled once. The belt's texture is smooth over
 //! several mm, so its own motion blur is left out.
 
-use super::random::Random;
+use super::belt::{TEXEL_MM, TILE, texture};
+use super::lamps::{Shadow, hidden_share};
 use super::scenario::{Material, Parcel, Scenario};
+use super::solid::{NOTHING, Solid, TOP};
 use crate::camera::{BeltView, Camera};
 use crate::error::Result;
 use crate::units::{BeltPx, RawPx};
 use nalgebra::Vector3;
 
-/// Texture tile: side in texels (a power of two) and their size.
-const TILE: usize = 1024;
-const TEXEL_MM: f32 = 1.5;
 /// Samples of an edge pixel in each direction.
 const SUB: usize = 4;
 const RAIL_MM: f32 = 40.0;
@@ -33,45 +32,10 @@ pub struct Renderer {
     surface: Vec<u8>,
     /// The parcels in view; room for all of them.
     solids: Vec<Solid>,
-}
-
-/// No parcel surface.
-const NOTHING: u8 = 0;
-
-/// A parcel in one frame, ready to be met by rays.
-struct Solid {
-    parcel: Parcel,
-    /// Of its edges.
-    radius: f32,
-    centre: [f32; 2],
-    sin: f32,
-    cos: f32,
-    half: [f32; 2],
-    height: f32,
-    /// Pixels it may cover: first and one past last column and row.
-    bounds: [usize; 4],
-}
-
-/// Where a ray meets a solid: surface identity and grey level.
-struct Hit {
-    surface: u8,
-    grey: f32,
-}
-
-/// A ray through a solid; its places are `from + s * along`.
-struct Crossing {
-    from: [f32; 3],
-    along: [f32; 3],
-    enter: f32,
-    leave: f32,
-    /// 0: top; 1, 2: the sides across the length; 3, 4: the others.
-    face: usize,
-}
-
-impl Crossing {
-    fn at(&self, s: f32) -> [f32; 3] {
-        [0, 1, 2].map(|k| self.from[k] + s * self.along[k])
-    }
+    /// Light on the belt by each lamp, image after image, as a share of full brightness.
+    lamp_light: Vec<f32>,
+    /// Where shadows may lie; room for those of all parcels.
+    shadows: Vec<Shadow>,
 }
 
 impl Renderer {
@@ -86,9 +50,20 @@ impl Renderer {
                 camera.belt_point(px).map_or([f32::NAN; 2], |p| [p.x as f32, p.y as f32])
             })
             .collect();
+        let lamps = &scenario.light.lamps;
+        let ground: Vec<[f32; 2]> = ground;
+        let lamp_light = lamps
+            .iter()
+            .flat_map(|lamp| {
+                ground.iter().map(|&[x, y]| lamp.irradiance([x, y, 0.0], [0.0, 0.0, 1.0]))
+            })
+            .collect();
+        let shadows = Vec::with_capacity(lamps.len() * scenario.parcels().len());
         let tile = texture(scenario.seed, scenario.belt.texture_grey);
         Ok(Self {
             solids: Vec::with_capacity(scenario.parcels().len()),
+            lamp_light,
+            shadows,
             scenario,
             centre: [centre.x as f32, centre.y as f32, centre.z as f32],
             ground,
@@ -121,6 +96,7 @@ impl Renderer {
         for solid in &solids {
             self.cast_shadow(solid, frame);
         }
+        self.cast_lamp_shadows(&solids, frame);
         for solid in &solids {
             self.classify(solid);
             self.draw(solid, light, blur_mm, frame);
@@ -149,16 +125,102 @@ impl Renderer {
         // The tile repeats, so only the travel within one tile matters.
         let tile_mm = f64::from(TEXEL_MM) * TILE as f64;
         let offset_mm = (travel_mm.rem_euclid(tile_mm)) as f32;
-        for (out, &[x, y]) in frame.iter_mut().zip(&self.ground) {
+        let pattern = belt.pattern.as_ref();
+        let shift_mm = pattern.map_or(0.0, |p| travel_mm.rem_euclid(p.pitch_mm)) as f32;
+        let px_mm = self.px_mm();
+        for (i, (out, &[x, y])) in frame.iter_mut().zip(&self.ground).enumerate() {
             let surface = if y.abs() <= half_width {
-                grey + self.texel(x - offset_mm, y)
+                let repeated = pattern.map_or(0.0, |p| p.grey(x - shift_mm, y, px_mm));
+                (grey + self.texel(x - offset_mm, y) + repeated).max(0.0)
             } else if y.abs() <= half_width + RAIL_MM {
                 120.0
             } else {
                 12.0
             };
-            *out = (surface * self.vignette(x, y) * light) as u16;
+            *out = (surface * self.vignette(x, y) * light * self.lamps_on_belt(i)) as u16;
         }
+    }
+
+    /// Size of a pixel on the belt in the middle of the image.
+    fn px_mm(&self) -> f32 {
+        let [width, height] = self.camera.image_size_px;
+        let i = height / 2 * width + width / 2;
+        let [a, b] = [self.ground[i], self.ground[i + 1]];
+        (a[0] - b[0]).hypot(a[1] - b[1])
+    }
+
+    /// Light on the belt at pixel `i` where no parcel is in the way; 1 without lamps.
+    fn lamps_on_belt(&self, i: usize) -> f32 {
+        let light = &self.scenario.light;
+        if light.lamps.is_empty() {
+            return 1.0;
+        }
+        let pixels = self.ground.len();
+        let by_lamps = (0..light.lamps.len()).map(|k| self.lamp_light[k * pixels + i]);
+        light.ambient as f32 + by_lamps.sum::<f32>()
+    }
+
+    /// Take away from the belt what the solids hide of the lamps.
+    fn cast_lamp_shadows(&mut self, solids: &[Solid], frame: &mut [u16]) {
+        let lamps = &self.scenario.light.lamps;
+        let mut shadows = std::mem::take(&mut self.shadows);
+        shadows.clear();
+        for (k, lamp) in lamps.iter().enumerate() {
+            let of_lamp = solids.iter().enumerate().map(|(n, s)| Shadow::new(k, lamp, n, s));
+            shadows.extend(of_lamp);
+        }
+        let pixels = self.ground.len();
+        for (i, &ground) in self.ground.iter().enumerate() {
+            let mut hidden = 0.0;
+            for (k, lamp) in lamps.iter().enumerate() {
+                let near = shadows.iter().filter(|s| s.lamp == k && s.may_hold(ground));
+                if near.clone().next().is_some() {
+                    let share = hidden_share(lamp, ground, &near, solids);
+                    hidden += share * self.lamp_light[k * pixels + i];
+                }
+            }
+            if hidden > 0.0 {
+                let left = (1.0 - hidden / self.lamps_on_belt(i)).max(0.0);
+                frame[i] = (f32::from(frame[i]) * left) as u16;
+            }
+        }
+        self.shadows = shadows;
+    }
+
+    /// Light on the top and the sides of a solid; 1 on the top and the usual shades of the sides
+    /// without lamps.
+    fn light_on(&self, solid: &Solid) -> [f32; 5] {
+        let light = &self.scenario.light;
+        if light.lamps.is_empty() {
+            return [1.0, 0.45, 0.55, 0.5, 0.6];
+        }
+        let [x, y] = solid.centre;
+        let (sin, cos) = (solid.sin, solid.cos);
+        let (a, b) = (solid.half[0], solid.half[1]);
+        let middle = 0.5 * solid.height;
+        let faces = [
+            ([x, y, solid.height], [0.0, 0.0, 1.0], 1.0),
+            ([x - cos * a, y - sin * a, middle], [-cos, -sin, 0.0], 0.5),
+            ([x + cos * a, y + sin * a, middle], [cos, sin, 0.0], 0.5),
+            ([x + sin * b, y - cos * b, middle], [sin, -cos, 0.0], 0.5),
+            ([x - sin * b, y + cos * b, middle], [-sin, cos, 0.0], 0.5),
+        ];
+        faces.map(|(at, normal, sky)| {
+            let by_lamps: f32 = light.lamps.iter().map(|l| l.irradiance(at, normal)).sum();
+            // A side sees half of the sky.
+            light.ambient as f32 * sky + by_lamps
+        })
+    }
+
+    /// Grey levels that the lamps' images add to a glossy top seen over a point of the belt.
+    fn glare(&self, solid: &Solid, ground: [f32; 2]) -> f32 {
+        if solid.parcel.material != Material::Glossy {
+            return 0.0;
+        }
+        let s = 1.0 - solid.height / self.centre[2];
+        let [x, y] = [0, 1].map(|k| self.centre[k] + s * (ground[k] - self.centre[k]));
+        let lamps = self.scenario.light.lamps.iter();
+        lamps.map(|l| l.glare(self.centre, [x, y, solid.height])).sum()
     }
 
     /// Bilinear texture at a point of the belt.
@@ -220,7 +282,10 @@ impl Renderer {
             clamp(bounds[2] - 2.0, height),
             clamp(bounds[3] + 3.0, height),
         ];
-        (bounds[0] < bounds[1] && bounds[2] < bounds[3]).then_some(Solid {
+        if bounds[0] >= bounds[1] || bounds[2] >= bounds[3] {
+            return None;
+        }
+        let mut solid = Solid {
             parcel: *parcel,
             radius: self.scenario.edge_radius_mm.min(0.45 * parcel.height_mm) as f32,
             centre: [x_mm as f32, parcel.y_mm as f32],
@@ -228,8 +293,11 @@ impl Renderer {
             cos: cos as f32,
             half: [0.5 * parcel.length_mm as f32, 0.5 * parcel.width_mm as f32],
             height: parcel.height_mm as f32,
+            light: [1.0; 5],
             bounds,
-        })
+        };
+        solid.light = self.light_on(&solid);
+        Some(solid)
     }
 
     /// Darken the belt around a footprint, less and less with the distance.
@@ -280,7 +348,8 @@ impl Renderer {
                     Some(self.supersample(solid, i, shade, blur_mm, f32::from(frame[i])))
                 };
                 if let Some(value) = sampled {
-                    frame[i] = value as u16;
+                    let glare = if here == TOP { self.glare(solid, ground) * shade } else { 0.0 };
+                    frame[i] = (value + glare) as u16;
                 }
             }
         }
@@ -310,181 +379,4 @@ impl Renderer {
 /// Shadows reach further from taller parcels.
 fn shadow_reach_mm(height_mm: f32) -> f32 {
     8.0 + 0.35 * height_mm
-}
-
-impl Solid {
-    /// A belt point in the parcel's own axes.
-    fn local(&self, [x, y]: [f32; 2]) -> [f32; 2] {
-        let (dx, dy) = (x - self.centre[0], y - self.centre[1]);
-        [self.cos * dx + self.sin * dy, self.cos * dy - self.sin * dx]
-    }
-
-    /// The ray from the camera to `ground`, in the axes of the solid moved by `shift_mm`, and the
-    /// part of it that is in the cuboid with sharp edges, from the face it enters by.
-    fn cross(&self, camera: [f32; 3], ground: [f32; 2], shift_mm: f32) -> Option<Crossing> {
-        let from = self.local([camera[0] - shift_mm, camera[1]]);
-        let to = self.local([ground[0] - shift_mm, ground[1]]);
-        // Slab method; s runs from the camera (0) to the belt (1). Source: Kay and Kajiya 1986.
-        let (mut enter, mut leave, mut face) = (1.0 - self.height / camera[2], 1.0, 0);
-        for axis in 0..2 {
-            let along = to[axis] - from[axis];
-            let at = |plane: f32| (plane - from[axis]) / along;
-            let (near, far) = if along > 0.0 {
-                (at(-self.half[axis]), at(self.half[axis]))
-            } else {
-                (at(self.half[axis]), at(-self.half[axis]))
-            };
-            if near > enter {
-                enter = near;
-                face = 1 + 2 * axis + usize::from(along < 0.0);
-            }
-            leave = f32::min(leave, far);
-        }
-        // A ray that misses the belt is NaN, and so is everything met by it.
-        let hit = enter.partial_cmp(&leave) == Some(std::cmp::Ordering::Less);
-        hit.then_some(Crossing {
-            from: [from[0], from[1], camera[2]],
-            along: [to[0] - from[0], to[1] - from[1], -camera[2]],
-            enter,
-            leave,
-            face,
-        })
-    }
-
-    /// Where a ray meets the solid as if its edges were sharp.
-    fn meet(&self, camera: [f32; 3], ground: [f32; 2], shift_mm: f32) -> Option<Hit> {
-        let ray = self.cross(camera, ground, shift_mm)?;
-        Some(self.shade_sharp(&ray, ray.at(ray.enter)))
-    }
-
-    fn shade_sharp(&self, ray: &Crossing, [a, b, z]: [f32; 3]) -> Hit {
-        if ray.face == 0 { self.top([a, b]) } else { self.side(ray.face, z) }
-    }
-
-    /// Grey level where a ray meets the solid with its rounded edges: sphere tracing (Hart 1996)
-    /// from the sharp cuboid's surface on. Radiance goes from the top's to the side's with
-    /// the cosine of the normal's tilt, as under diffuse light.
-    fn meet_rounded(&self, camera: [f32; 3], ground: [f32; 2], shift_mm: f32) -> Option<f32> {
-        const NEAR_MM: f32 = 0.02;
-        const STEPS: usize = 16;
-        let ray = self.cross(camera, ground, shift_mm)?;
-        let [a, b, z] = ray.at(ray.enter);
-        let core = |k: usize, at: f32| at.abs() <= self.half[k] - self.radius;
-        if ray.face == 0 && core(0, a) && core(1, b) {
-            return Some(self.top([a, b]).grey);
-        }
-        if self.radius == 0.0 {
-            return Some(self.shade_sharp(&ray, [a, b, z]).grey);
-        }
-        let length = ray.along.iter().map(|a| a * a).sum::<f32>().sqrt();
-        let mut s = ray.enter;
-        for _ in 0..STEPS {
-            let p = ray.at(s);
-            // It goes on below the belt, so that its bottom edges are not rounded.
-            let core = [
-                p[0].abs() - (self.half[0] - self.radius),
-                p[1].abs() - (self.half[1] - self.radius),
-                p[2] - (self.height - self.radius),
-            ];
-            let outside = core.map(|c| c.max(0.0));
-            let distance = outside.iter().map(|c| c * c).sum::<f32>().sqrt() - self.radius
-                + core[0].max(core[1]).max(core[2]).min(0.0);
-            if distance < NEAR_MM {
-                return Some(self.shade(p, outside));
-            }
-            s += distance / length;
-            if s > ray.leave {
-                return None;
-            }
-        }
-        None
-    }
-
-    /// Grey level at a point of the surface whose normal has the direction `normal` in the
-    /// octant of the point.
-    fn shade(&self, [a, b, z]: [f32; 3], normal: [f32; 3]) -> f32 {
-        let [x2, y2, z2] = normal.map(|n| n * n);
-        let top = || self.top([a, b]).grey;
-        if x2 + y2 == 0.0 {
-            return top();
-        }
-        let side_x = || self.side(1 + usize::from(a > 0.0), z).grey;
-        let side_y = || self.side(3 + usize::from(b > 0.0), z).grey;
-        let side = (x2 * side_x() + y2 * side_y()) / (x2 + y2);
-        let cosine = (z2 / (x2 + y2 + z2)).sqrt();
-        if cosine == 0.0 { side } else { side + cosine * (top() - side) }
-    }
-
-    /// Top face: plain, tape along the middle, label with bars.
-    fn top(&self, [a, b]: [f32; 2]) -> Hit {
-        let plain = match self.parcel.material {
-            Material::Kraft => 105.0,
-            Material::White => 190.0,
-            Material::Dark => 20.0,
-        };
-        // A label in one quarter, up to 80 x 50 mm.
-        let label = [(0.4 * self.half[0]).min(40.0), (0.4 * self.half[1]).min(25.0)];
-        let (la, lb) = (a + 0.45 * self.half[0], b - 0.4 * self.half[1]);
-        if la.abs() < label[0] && lb.abs() < label[1] {
-            let bar = lb < 0.0 && ((la + label[0]) / 3.0) as u32 % 2 == 1;
-            return if bar {
-                Hit { surface: 3, grey: 40.0 }
-            } else {
-                Hit { surface: 2, grey: 215.0 }
-            };
-        }
-        let tape_half = (0.25 * self.half[1]).min(25.0);
-        if self.parcel.material == Material::Kraft && b.abs() < tape_half {
-            return Hit { surface: 4, grey: 135.0 };
-        }
-        Hit { surface: 1, grey: plain }
-    }
-
-    /// Side face: darker than the top, and towards the belt.
-    fn side(&self, face: usize, z_mm: f32) -> Hit {
-        let top = match self.parcel.material {
-            Material::Kraft => 105.0,
-            Material::White => 190.0,
-            Material::Dark => 20.0,
-        };
-        let turned = [0.45, 0.55, 0.5, 0.6][face - 1];
-        let lower = 0.7 + 0.3 * (z_mm / self.height).clamp(0.0, 1.0);
-        Hit { surface: 4 + face as u8, grey: top * turned * lower }
-    }
-}
-
-/// Smooth belt texture with scratches, mean 0, standard deviation `sigma`.
-fn texture(seed: u64, sigma: f64) -> Vec<f32> {
-    let mut random = Random(seed ^ 0x7465_7874);
-    let mut tile: Vec<f32> = (0..TILE * TILE).map(|_| random.normal() as f32).collect();
-    for _ in 0..3 {
-        tile = blurred(&tile);
-    }
-    for _ in 0..40 {
-        let (mut u, mut v) = (random.unit() * TILE as f64, random.unit() * TILE as f64);
-        let angle = random.between([-0.4, 0.4]);
-        let depth = random.between([-0.5, 0.5]) as f32;
-        for _ in 0..60 {
-            tile[(v as usize % TILE) * TILE + u as usize % TILE] += depth;
-            u += angle.cos();
-            v = (v + angle.sin()).rem_euclid(TILE as f64);
-        }
-    }
-    tile = blurred(&tile);
-    let variance = tile.iter().map(|t| t * t).sum::<f32>() / tile.len() as f32;
-    let scale = sigma as f32 / variance.sqrt().max(f32::MIN_POSITIVE);
-    tile.iter().map(|t| t * scale).collect()
-}
-
-/// 3x3 mean on the torus.
-fn blurred(tile: &[f32]) -> Vec<f32> {
-    let at = |u: usize, v: usize| tile[(v % TILE) * TILE + u % TILE];
-    let mut out = Vec::with_capacity(tile.len());
-    for v in TILE..2 * TILE {
-        for u in TILE..2 * TILE {
-            let near = (v - 1..v + 2).flat_map(|v| (u - 1..u + 2).map(move |u| (u, v)));
-            out.push(near.map(|(u, v)| at(u, v)).sum::<f32>() / 9.0);
-        }
-    }
-    out
 }

@@ -1,6 +1,9 @@
 //! The scenario file: everything about a synthetic sequence, and nothing twice.
 
+use super::belt::PatternTable;
+use super::lamps::Lamp;
 use super::random::Random;
+use super::sensor::SensorTable;
 use crate::camera::{Camera, CameraFile};
 use crate::error::{Error, Result};
 use serde::Deserialize;
@@ -30,6 +33,9 @@ pub struct Scenario {
     /// Sensor noise.
     #[serde(default)]
     pub noise: NoiseTable,
+    /// Lens and electronics.
+    #[serde(default)]
+    pub sensor: SensorTable,
     /// Parcels, one by one.
     #[serde(default, rename = "parcel")]
     parcels: Vec<Parcel>,
@@ -54,9 +60,21 @@ pub struct BeltTable {
     pub grey: f64,
     /// Standard deviation of its texture.
     pub texture_grey: f64,
+    /// What repeats on it.
+    pub pattern: Option<PatternTable>,
+    /// Its speed swings by this share.
+    #[serde(default)]
+    pub ripple: f64,
+    /// Period of that.
+    #[serde(default = "ripple_period_s")]
+    pub ripple_period_s: f64,
     /// Stops, in order of time.
     #[serde(default, rename = "stop")]
     pub stops: Vec<StopTable>,
+}
+
+fn ripple_period_s() -> f64 {
+    1.0
 }
 
 /// `[[belt.stop]]`
@@ -81,11 +99,42 @@ pub struct LightTable {
     pub drift_period_s: f64,
     /// Darkening right beside a parcel, 0 to 1.
     pub shadow: f64,
+    /// Share of full brightness that comes from everywhere. Only with lamps.
+    pub ambient: f64,
+    /// Lamps. None: even light that casts no shadow but the one beside a parcel.
+    #[serde(rename = "lamp")]
+    pub lamps: Vec<Lamp>,
+    /// Relative amplitude of the mains' flicker.
+    pub flicker: f64,
+    /// Frequency of that: twice the mains'.
+    pub flicker_hz: f64,
+    /// Steps of brightness.
+    #[serde(rename = "step")]
+    pub steps: Vec<StepTable>,
+}
+
+/// `[[light.step]]`
+#[derive(Clone, Copy, Debug, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct StepTable {
+    /// When.
+    pub at_s: f64,
+    /// All light is multiplied by this from then on.
+    pub factor: f64,
 }
 
 impl Default for LightTable {
     fn default() -> Self {
-        Self { drift: 0.0, drift_period_s: 10.0, shadow: 0.45 }
+        Self {
+            drift: 0.0,
+            drift_period_s: 10.0,
+            shadow: 0.45,
+            ambient: 0.4,
+            lamps: Vec::new(),
+            flicker: 0.0,
+            flicker_hz: 100.0,
+            steps: Vec::new(),
+        }
     }
 }
 
@@ -115,6 +164,10 @@ pub enum Material {
     White,
     /// Black, with a label.
     Dark,
+    /// White under a film that mirrors the lamps.
+    Glossy,
+    /// Printed all over.
+    Printed,
 }
 
 /// `[[parcel]]`: a cuboid on the belt.
@@ -161,16 +214,28 @@ impl Scenario {
         let belt = &scenario.belt;
         let usable = scenario.fps > 0.0
             && belt.speed_mm_per_s > 0.0
+            && belt.ripple.abs() < 1.0
+            && belt.ripple_period_s > 0.0
+            && belt.pattern.is_none_or(|p| p.pitch_mm > 0.0)
             && belt.stops.iter().all(|s| s.at_s >= 0.0 && s.for_s >= 0.0 && s.ramp_s > 0.0)
+            && scenario.sensor.is_usable()
+            && scenario.light.lamps.iter().all(|l| l.radius_mm >= 0.0 && l.strength >= 0.0)
             && scenario.parcels.iter().all(|p| p.length_mm >= p.width_mm && p.height_mm > 0.0);
         if !usable {
             return Err(Error::configuration("the scenario cannot be rendered").allowed(
-                "fps, speed and ramp_s above 0, stops not negative, length >= width, height above 0",
+                "fps, speed and ramp_s above 0, stops not negative, length >= width, height above 0, \
+                 ripple below 1, periods and pitch above 0, lamps above every parcel, blur_px 0 to 2.5, vibration_px \
+                 0 to 1, gamma 0.3 to 3, denoise 0 to 0.9, jpeg_quality 0 to 100",
             ));
         }
         if let Some(random) = scenario.random.take() {
             let mut generator = Random(scenario.seed);
             scenario.parcels.extend(random.draw(&mut generator));
+        }
+        let height_max_mm = scenario.parcels.iter().map(|p| p.height_mm).fold(0.0, f64::max);
+        if scenario.light.lamps.iter().any(|l| l.z_mm <= height_max_mm) {
+            return Err(Error::configuration("light.lamp: z_mm is below a parcel's top")
+                .allowed(format!("above {height_max_mm} mm")));
         }
         Ok(scenario)
     }
@@ -188,7 +253,10 @@ impl Scenario {
     /// Belt travel at a time, mm.
     pub fn travel_mm(&self, t_s: f64) -> f64 {
         let lost_s: f64 = self.belt.stops.iter().map(|s| s.lost_s(t_s)).sum();
-        self.belt.speed_mm_per_s * (t_s - lost_s)
+        let run_s = t_s - lost_s;
+        let pulse = std::f64::consts::TAU / self.belt.ripple_period_s;
+        let ahead_s = self.belt.ripple * (1.0 - (pulse * run_s).cos()) / pulse;
+        self.belt.speed_mm_per_s * (run_s + ahead_s)
     }
 
     /// Belt travel in the middle of a frame's exposure.
@@ -199,7 +267,11 @@ impl Scenario {
     /// Brightness of the light at a time, around 1.
     pub fn brightness(&self, t_s: f64) -> f64 {
         let phase = std::f64::consts::TAU * t_s / self.light.drift_period_s;
-        1.0 + self.light.drift * phase.sin()
+        let mains = std::f64::consts::TAU * t_s * self.light.flicker_hz;
+        let steps = self.light.steps.iter().filter(|s| t_s >= s.at_s).map(|s| s.factor);
+        (1.0 + self.light.drift * phase.sin())
+            * (1.0 + self.light.flicker * mains.sin())
+            * steps.product::<f64>()
     }
 }
 
