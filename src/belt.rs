@@ -116,6 +116,13 @@ impl Encoder {
         Self { mm_per_count, bits, timeout_s, speed_max_mm_per_s, last, anew: false, positions }
     }
 
+    /// Another scale from here on: what was before has no common zero with it.
+    pub fn set_mm_per_count(&mut self, mm_per_count: f64) {
+        self.mm_per_count = mm_per_count;
+        self.positions.clear();
+        self.anew = true;
+    }
+
     /// A count that came at `t_s`.
     pub fn count(&mut self, count: u32, t_s: f64) {
         let unused = 32 - self.bits;

@@ -208,6 +208,11 @@ impl Pipeline {
         self.witnesses.encoder(position_mm);
     }
 
+    /// The encoder has another scale from here on: what it showed before is forgotten.
+    pub fn forget_encoder(&mut self) {
+        self.witnesses.forget_encoder();
+    }
+
     /// Over a gap that the view cannot bridge (frames missing, time stamps that run back) nothing is
     /// known of the belt: what was inside is told, and followed no more.
     fn lose_belt(&mut self, emit: &mut dyn FnMut(ParcelRecord)) {

@@ -63,6 +63,11 @@ impl Witnesses {
         self.encoder_mm[0] = Some(position_mm).filter(|mm| mm.is_finite());
     }
 
+    /// The encoder has another scale from here on.
+    pub fn forget_encoder(&mut self) {
+        *self = Self::default();
+    }
+
     /// The belt's step since the last frame, if the encoder was read at both.
     pub fn encoder_step_mm(&mut self) -> Option<f64> {
         let [here, before] = self.encoder_mm;

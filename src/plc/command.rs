@@ -4,21 +4,27 @@ use std::fmt;
 use std::net::IpAddr;
 
 /// What a PLC asks of the vision thread.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+#[derive(Clone, Copy, Debug, PartialEq)]
 pub enum Request {
     /// The belt is empty: forget the background and learn it anew.
     Learn,
     /// Report parcels, or do not.
     Report(bool),
+    /// A count of the encoder is so many mm of belt.
+    MmPerCount(f64),
 }
 
 /// Codes of the commands and their meanings.
-pub const COMMANDS: [(u16, &str); 5] = [
+pub const COMMANDS: [(u16, &str); 6] = [
     (1, "acknowledge parcels up to sequence number `argument`, as register `acknowledge` does"),
     (2, "learn the empty belt anew: takes background.learn_frames, parcels in view are forgotten"),
     (3, "start: report parcels"),
     (4, "stop: report none until started"),
     (5, "round dimensions to multiples of `argument` tenths of a mm, 1 to 500"),
+    (
+        6,
+        "correct the encoder's scale by the belt's texture: mm_per_count becomes mm_per_count_seen, for good",
+    ),
 ];
 
 /// Who gave a command.
@@ -54,11 +60,13 @@ pub enum Outcome {
     Busy,
     /// The ticket is that of the last command, which was another one.
     TicketUsed,
+    /// What it needs is not known at present.
+    NotKnown,
 }
 
 impl Outcome {
     /// Codes and meanings.
-    pub const ALL: [(Self, &str); 6] = [
+    pub const ALL: [(Self, &str); 7] = [
         (Self::None, "no command yet"),
         (Self::Done, "done"),
         (Self::Unknown, "no such command"),
@@ -67,6 +75,10 @@ impl Outcome {
         (
             Self::TicketUsed,
             "the last command, another one, had this ticket: nothing was done, take the next ticket",
+        ),
+        (
+            Self::NotKnown,
+            "what it needs is not known: no encoder, or the belt has not travelled far enough",
         ),
     ];
 }

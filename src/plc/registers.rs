@@ -77,6 +77,26 @@ pub struct VisionStatus {
     pub import: ImportStatus,
     /// What the pipeline counts.
     pub counters: Counters,
+    /// What is known of the belt beside its speed.
+    pub belt: BeltStatus,
+}
+
+/// What the pictures show of the belt, and what disagrees with it.
+#[derive(Clone, Copy, Debug, Default, PartialEq)]
+#[allow(clippy::struct_excessive_bools)] // they become bits
+pub struct BeltStatus {
+    /// Speed that the pictures show; negative: against +X.
+    pub seen_mm_per_s: Option<f64>,
+    /// It is another than the configuration's, or against +X.
+    pub not_as_configured: bool,
+    /// The texture repeats itself: several speeds would explain it.
+    pub ambiguous: bool,
+    /// Texture or noise are so strong that they hide parcels.
+    pub hides_parcels: bool,
+    /// The encoder's travel over that of the texture.
+    pub encoder_ratio: Option<f64>,
+    /// The encoder shows another travel than the belt: it is not used.
+    pub encoder_disagrees: bool,
 }
 
 /// State of the CAN controller.
@@ -146,10 +166,12 @@ pub struct Status {
     pub scale_interval_mm: f64,
     /// Where numbers, acknowledgments and tickets are kept.
     pub keeping: Keeping,
+    /// Belt travel of an encoder's count, as configured or set by command.
+    pub mm_per_count: Option<f64>,
 }
 
 /// What is wrong or worth knowing: code and meaning.
-pub const REASONS: [(u16, &str); 15] = [
+pub const REASONS: [(u16, &str); 19] = [
     (0, "all is well"),
     (1, "the frame source has ended or failed"),
     (2, "no frames arrive"),
@@ -168,9 +190,22 @@ pub const REASONS: [(u16, &str); 15] = [
         14,
         "the disk fails: sequence numbers, acknowledgments and tickets would not survive a restart; see the log",
     ),
+    (
+        15,
+        "the encoder and the belt disagree: see encoder_ratio; correct encoder.mm_per_count, or give command 6",
+    ),
+    (16, "the belt does not run as configured: see belt_seen for its speed and direction"),
+    (17, "the belt's texture repeats itself, so that its motion is ambiguous: fit an encoder"),
+    (18, "the belt's texture or the camera's noise is so strong that it hides parcels"),
 ];
 
 impl Status {
+    /// Belt travel of an encoder's count, as the belt's texture shows it.
+    pub fn mm_per_count_seen(&self) -> Option<f64> {
+        let ratio = self.vision.belt.encoder_ratio.filter(|ratio| *ratio > 0.0)?;
+        Some(self.mm_per_count? / ratio)
+    }
+
     fn overflows(&self) -> u64 {
         let c = &self.vision.counters;
         c.segment_overflows + c.track_overflows + c.event_overflows
@@ -199,6 +234,9 @@ impl Status {
             self.encoder_silent,
             self.vision.camera_absent,
             self.keeping == Keeping::Failing,
+            self.vision.belt.encoder_disagrees,
+            self.vision.belt.not_as_configured,
+            self.vision.belt.hides_parcels,
         ])
     }
 
@@ -214,8 +252,12 @@ impl Status {
             (5, self.can.state == CanState::Passive),
             (14, self.keeping == Keeping::Failing),
             (6, self.encoder_silent),
+            (15, self.vision.belt.encoder_disagrees),
+            (16, self.vision.belt.not_as_configured),
             (7, self.plc_silent),
             (8, !self.vision.ready),
+            (18, self.vision.belt.hides_parcels),
+            (17, self.vision.belt.ambiguous),
             (9, self.stopped),
             (13, self.vision.import.result == IMPORT_REFUSED),
             (10, self.queue_overflows > 0),
@@ -255,7 +297,7 @@ fn wrapped(count: u64) -> f64 {
     f64::from(count as u32)
 }
 
-/// Identity, status and counters, at address 0.
+/// Identity, status and counters, at address 0, before and after the command block.
 #[rustfmt::skip]
 pub const STATUS_FIELDS: &[StatusField] = fields![
     [0, V1_0, "identity", U16, "", 1.0, "constant 0x4247, \"BG\"", |_| f64::from(0x4247)],
@@ -264,7 +306,7 @@ pub const STATUS_FIELDS: &[StatusField] = fields![
     [4, V1_0, "test_i16", I16, "", 1.0, "constant -12345: checks the sign", |_| -12345.0],
     [10, V1_0, "heartbeat", U16, "", 1.0, "rises ten times a second while frames arrive; wraps", |s| f64::from(s.heartbeat)],
     [11, V1_0, "status", U16, "bits", 1.0, "bit 0 running, bit 1 ready (belt learned), bit 2 belt motion measured, bit 3 by the encoder, bit 4 stopped by command, bit 5 PLC silent, bit 6 parcels wait to be acknowledged", |s| f64::from(s.status_bits())],
-    [12, V1_0, "fault", U16, "bits", 1.0, "bit 0 frame source ended, bit 1 a table has been full since start (see counters), bit 2 a parcel was never acknowledged, bit 3 CAN bus off or down, bit 4 encoder silent, bit 5 no camera, bit 6 the disk fails", |s| f64::from(s.fault_bits())],
+    [12, V1_0, "fault", U16, "bits", 1.0, "bit 0 frame source ended, bit 1 a table has been full since start (see counters), bit 2 a parcel was never acknowledged, bit 3 CAN bus off or down, bit 4 encoder silent, bit 5 no camera, bit 6 the disk fails, bit 7 encoder and belt disagree, bit 8 the belt does not run as configured, bit 9 the belt hides parcels", |s| f64::from(s.fault_bits())],
     [13, V1_0, "belt_speed", U32, "mm/s", 10.0, "belt speed", |s| s.vision.belt_speed_mm_per_s],
     [15, V1_0, "frames", U32, "", 1.0, "frames processed; wraps", |s| wrapped(s.vision.counters.frames)],
     [17, V1_0, "frames_dropped", U32, "", 1.0, "frames that came too late; wraps", |s| wrapped(s.vision.frames_dropped)],
@@ -294,6 +336,10 @@ pub const STATUS_FIELDS: &[StatusField] = fields![
     [56, V1_2, "camera_losses", U16, "", 1.0, "how often the camera was lost; wraps", |s| f64::from(s.vision.camera_losses as u16)],
     [57, V1_2, "imports", U16, "", 1.0, "configurations that came on a stick; wraps", |s| f64::from(s.vision.import.count)],
     [58, V1_2, "import_result", U16, "", 1.0, "of the last: 0 there was none, 1 applied, 2 refused, 3 rolled back", |s| f64::from(s.vision.import.result)],
+    [70, V2_0, "belt_seen", I32, "mm/s", 10.0, "belt speed that the pictures show, negative against +X; 0: none", |s| s.vision.belt.seen_mm_per_s.unwrap_or(0.0)],
+    [72, V2_0, "encoder_ratio", U16, "", 10000.0, "the encoder's travel over the belt's; 0: not known", |s| s.vision.belt.encoder_ratio.unwrap_or(0.0)],
+    [73, V2_0, "mm_per_count", I32, "mm", 1_000_000.0, "belt travel of a count, as configured or set by command 6; 0: no encoder", |s| s.mm_per_count.unwrap_or(0.0)],
+    [75, V2_0, "mm_per_count_seen", I32, "mm", 1_000_000.0, "the same as the belt's texture shows it; 0: not known", |s| s.mm_per_count_seen().unwrap_or(0.0)],
 ];
 
 /// What a PLC writes, from [`COMMAND`] on.
@@ -413,7 +459,10 @@ mod tests {
 
     #[test]
     fn fields_do_not_overlap_and_blocks_hold_them() {
-        fields_fit(STATUS_FIELDS, COMMAND);
+        fields_fit(STATUS_FIELDS, LATEST);
+        let own = COMMAND..COMMAND + COMMAND_COUNT;
+        let registers = |f: &StatusField| f.offset..f.offset + f.kind.registers();
+        assert!(STATUS_FIELDS.iter().flat_map(registers).all(|r| !own.contains(&r)));
         fields_fit(COMMAND_FIELDS, COMMAND_COUNT);
         fields_fit(PARCEL_FIELDS, PARCEL_STRIDE);
         const { assert!(COMMAND + COMMAND_COUNT <= LATEST) }
@@ -474,7 +523,7 @@ mod tests {
         status.can.state = CanState::BusOff;
         assert_eq!(status.reason(), 3);
         let codes = REASONS.iter().map(|(code, _)| *code);
-        assert!(codes.eq(0..15));
+        assert!(codes.eq(0..19));
     }
 
     #[test]

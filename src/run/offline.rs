@@ -6,7 +6,9 @@ use crate::config::Site;
 use crate::error::{Error, Result};
 use crate::event::{Counters, ParcelRecord};
 use crate::image::Plane;
+use crate::pipeline::Pipeline;
 use crate::source::FrameSource;
+use crate::stage::odometry::Knowledge;
 use std::io::{BufWriter, Write};
 use std::path::Path;
 
@@ -88,10 +90,48 @@ pub fn measure(
             if let Some(doubt) = source.doubt() {
                 observer.doubt(&doubt);
             }
+            if let Some(doubt) = belt_doubt(&pipeline) {
+                observer.doubt(&doubt);
+            }
             result?;
             annotator.map_or(Ok(()), Annotator::finish)?;
             return Ok(pipeline.counters());
         }
+    }
+}
+
+/// What of the belt is not as the configuration says, at the end of a recording.
+fn belt_doubt(pipeline: &Pipeline) -> Option<String> {
+    let health = pipeline.health();
+    let nominal = pipeline.site().config.belt.speed_mm_per_s;
+    let seen = health.belt_seen_mm_per_s.filter(|_| health.belt_not_as_configured);
+    if let Some(speed) = seen {
+        let against = if speed < 0.0 { " against +X" } else { "" };
+        let speed = speed.abs();
+        return Some(format!(
+            "the belt runs at {speed:.0} mm/s{against}; belt.speed_mm_per_s = {nominal}: correct it, or \
+             the travel direction of the calibration"
+        ));
+    }
+    if health.belt_hides_parcels {
+        return Some(format!(
+            "a parcel must differ from this belt by {:.0} grey levels: less light on the belt, a smaller \
+             gain, or another belt would show more",
+            health.contrast_min_grey
+        ));
+    }
+    match health.texture {
+        Knowledge::Ambiguous => Some(
+            "the belt's texture repeats itself: its motion is ambiguous; an encoder tells it"
+                .into(),
+        ),
+        Knowledge::Refuted => {
+            Some("what the belt's texture shows is not its motion: parcels move against it".into())
+        }
+        Knowledge::NoTexture => Some(
+            "the belt shows no texture: its nominal speed was assumed; an encoder tells it".into(),
+        ),
+        Knowledge::Measured => None,
     }
 }
 

@@ -154,7 +154,7 @@ impl Link {
                 }
                 None => (Outcome::Argument, None),
             },
-            2..=4 if busy => (Outcome::Busy, None),
+            2..=4 | 6 if busy => (Outcome::Busy, None),
             2 => (Outcome::Done, Some(Request::Learn)),
             3 | 4 => {
                 let reporting = command == 3;
@@ -170,6 +170,15 @@ impl Link {
                 (Outcome::Done, None)
             }
             5 => (Outcome::Argument, None),
+            6 => match (self.configured_mm_per_count, self.status.mm_per_count_seen()) {
+                (Some(configured), Some(set)) => {
+                    self.journal.change(|state| {
+                        state.mm_per_count = Some(Override { configured, set });
+                    });
+                    (Outcome::Done, Some(Request::MmPerCount(set)))
+                }
+                _ => (Outcome::NotKnown, None),
+            },
             _ => (Outcome::Unknown, None),
         }
     }

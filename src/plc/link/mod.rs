@@ -37,6 +37,7 @@ pub struct Link {
     settings: Settings,
     /// What the configuration says, whatever a command has set.
     configured_scale_interval_mm: f64,
+    configured_mm_per_count: Option<f64>,
     order: WordOrder,
     image: RegisterImage,
     status: Status,
@@ -100,6 +101,7 @@ impl Link {
         };
         let mut link = Self {
             configured_scale_interval_mm: settings.scale_interval_mm,
+            configured_mm_per_count: None,
             settings,
             order,
             image: RegisterImage::new(order),
@@ -124,6 +126,19 @@ impl Link {
         link.take_up(&state);
         link.show();
         link
+    }
+
+    /// An encoder is configured: its scale, unless a command has set another one.
+    #[must_use]
+    pub fn with_encoder(mut self, mm_per_count: Option<f64>) -> Self {
+        self.configured_mm_per_count = mm_per_count;
+        self.status.mm_per_count = mm_per_count
+            .map(|configured| Override::of(self.journal.state().mm_per_count, configured));
+        if let Some(set) = self.status.mm_per_count.filter(|set| Some(*set) != mm_per_count) {
+            let _ = self.requests.push_back(Request::MmPerCount(set)); // invariant: there is room
+        }
+        self.show();
+        self
     }
 
     /// What was before the restart holds again.
@@ -259,6 +274,11 @@ impl Link {
 
     fn carry_out(&mut self, decided: &Decided) {
         if let Some(request) = decided.request {
+            if let Request::MmPerCount(set) = request {
+                self.status.mm_per_count = Some(set);
+                // The ratio that was known was that of the scale before.
+                self.status.vision.belt.encoder_ratio = None;
+            }
             let _ = self.requests.push_back(request); // invariant: room was asked for
         }
         let state = self.journal.state();

@@ -272,3 +272,28 @@ fn a_disk_that_fails_is_told_and_holds_nobody_up() {
     link.command(3, 4, 0, SENDER);
     assert_eq!(link.status().ticket, 3);
 }
+
+#[test]
+fn the_encoder_s_scale_is_corrected_by_the_belt_and_stays_so() {
+    let path = std::env::temp_dir().join(format!("beltgauge-scale-{}", std::process::id()));
+    let _ = std::fs::remove_file(&path);
+    let mut link = on_disk(&path, Settings::default()).with_encoder(Some(0.05));
+    assert_eq!(link.command(1, 6, 0, SENDER).outcome, Outcome::NotKnown as u16);
+    let mut vision = VisionStatus::default();
+    vision.belt.encoder_ratio = Some(1.25);
+    vision.belt.encoder_disagrees = true;
+    link.update(&vision, &CanStatus::default(), None, Instant::now());
+    assert_eq!(link.status().fault_bits() & 128, 128);
+    assert_eq!(link.read(72, 5), Some(&[12500, 0, 50000, 0, 40000][..]));
+    let noted = link.command(2, 6, 0, SENDER).noted;
+    wait_until_kept(&mut link, noted);
+    assert_eq!(link.next_request(), Some(Request::MmPerCount(0.04)));
+    drop(link);
+    let mut link = on_disk(&path, Settings::default()).with_encoder(Some(0.05));
+    assert_eq!(link.next_request(), Some(Request::MmPerCount(0.04)));
+    drop(link);
+    // A configuration that was corrected since then outdoes the command.
+    let mut link = on_disk(&path, Settings::default()).with_encoder(Some(0.041));
+    assert_eq!(link.next_request(), None);
+    let _ = std::fs::remove_file(&path);
+}

@@ -201,7 +201,8 @@ impl Appliance {
                 let mut can = CanLink::<CanFdSocket>::new(config.can.clone(), now);
                 let sends = config.can.interface.is_some();
                 let order = config.modbus.word_order;
-                let link = Link::new(config.plc.clone(), order, sends, journal, now);
+                let link = Link::new(config.plc.clone(), order, sends, journal, now)
+                    .with_encoder(config.encoder.mm_per_count);
                 let mut ended_at = None;
                 modbus::serve(listener, &config.modbus, link, |link| {
                     shared.beats.plc.beat();

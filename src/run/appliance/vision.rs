@@ -6,11 +6,13 @@ use crate::config::Realtime;
 use crate::error::{Error, Result};
 use crate::event::ParcelRecord;
 use crate::image::Plane;
-use crate::pipeline::Pipeline;
+use crate::pipeline::{Health, Pipeline};
 use crate::plan::Block;
 use crate::plc::command::Request;
+use crate::plc::registers::BeltStatus;
 use crate::run::realtime;
 use crate::source::Taken;
+use crate::stage::odometry::Knowledge;
 use heapless::spsc::{Consumer, Producer};
 use std::sync::atomic::Ordering;
 use std::time::{Duration, Instant};
@@ -92,6 +94,12 @@ impl Vision<'_> {
             match request {
                 Request::Learn => self.pipeline.learn(),
                 Request::Report(reporting) => self.pipeline.report_parcels(reporting),
+                Request::MmPerCount(mm_per_count) => {
+                    if let Some((encoder, _)) = &mut self.encoder {
+                        encoder.set_mm_per_count(mm_per_count);
+                    }
+                    self.pipeline.forget_encoder();
+                }
             }
         }
     }
@@ -121,6 +129,19 @@ impl Vision<'_> {
         status.belt_measured = measured || status.by_encoder;
         status.belt_travel_mm = self.pipeline.belt_position().travel_mm;
         status.time_s = time_s;
+        status.belt = belt_status(&self.pipeline.health());
         progress.frame_time_max = progress.frame_time_max.max(frame_time);
+    }
+}
+
+/// In the words of the PLC's interface.
+fn belt_status(health: &Health) -> BeltStatus {
+    BeltStatus {
+        seen_mm_per_s: health.belt_seen_mm_per_s,
+        not_as_configured: health.belt_not_as_configured,
+        ambiguous: health.texture == Knowledge::Ambiguous,
+        hides_parcels: health.belt_hides_parcels,
+        encoder_ratio: health.encoder_ratio.map(|(ratio, _)| ratio),
+        encoder_disagrees: health.encoder_disagrees,
     }
 }
