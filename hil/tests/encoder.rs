@@ -41,7 +41,7 @@ fn measure(counting: bool) -> Vec<ParcelRecord> {
     let config = format!(
         "[camera]\ncalibration = \"the scenario's\"\n[belt]\nspeed_mm_per_s = 500\n\
          [zone]\nx_min_mm = -600\nx_max_mm = 600\ny_min_mm = -300\ny_max_mm = 300\n\
-         [modbus]\nlisten = \"{address}\"\n\
+         [modbus]\nlisten = \"{address}\"\nwrite_allow = [\"127.0.0.1\"]\n\
          [encoder]\nmm_per_count = {MM_PER_COUNT}\nbits = {BITS}\n"
     );
     let scenario = Scenario::parse(&text).expect("valid");
