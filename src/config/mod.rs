@@ -1,11 +1,13 @@
 //! TOML -> validated [`Config`]. Every key but those of the smallest configuration has a default;
 //! unknown keys are refused; a wrong value names file, key, value, allowed range and remedy.
 
+mod plc;
 mod schema;
 
+pub use plc::{Can, DimensionOrder, Encoder, Modbus, Plc, WordOrder};
 pub use schema::{
-    Background, CameraTable, Can, Config, DimensionOrder, Encoder, Import, Interface, Limits,
-    Measure, Modbus, Odometry, Plc, Realtime, Segment, View, WordOrder, public_key,
+    Background, CameraTable, Config, Import, Interface, Limits, Measure, Odometry, Realtime,
+    Segment, View, public_key,
 };
 
 use crate::camera::{BeltView, Camera, CameraFile};

@@ -114,8 +114,8 @@ fn a_parcel_that_was_written_before_its_state_is_not_numbered_again() {
 fn a_damaged_file_is_set_aside_and_its_numbers_are_not_given_again() {
     let folder = folder("damaged");
     let path = folder.join("state");
-    for damaged in [&b"{\"boots\":1}"[..], &[0xff; 64], &[1; 100_000]] {
-        std::fs::write(&path, damaged).expect("writable");
+    for damaged in [b"{\"boots\":1}".to_vec(), vec![0xff; 64], vec![1; 100_000]] {
+        std::fs::write(&path, &damaged).expect("writable");
         let mut journal = open(&path);
         until("written", || journal.keeping() == Keeping::Disk);
         assert_eq!(std::fs::read(folder.join("state.damaged")).expect("kept"), damaged);
