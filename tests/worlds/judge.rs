@@ -1,13 +1,12 @@
 //! Holds what was reported against what is true.
 
-use beltgauge::event::{Flags, ParcelRecord, Shape};
+use beltgauge::event::ParcelRecord;
 use beltgauge::source::synthetic::{Parcel, Scenario};
 
 /// A record belongs to the parcel whose true centre is this near.
 const MATCH_MM: f64 = 60.0;
 /// A dimension that is off by more, and by more than 3 sigma, must not be usable.
 const WRONG_MM: f64 = 3.0;
-const SIGMA_MAX_MM: f64 = 3.0;
 
 /// Counts over worlds.
 #[derive(Clone, Debug, Default)]
@@ -64,14 +63,6 @@ impl Verdict {
     }
 }
 
-/// Whether a sorter may rest on the dimensions.
-pub fn may_be_used(record: &ParcelRecord) -> bool {
-    let sigmas = sigmas_mm(record);
-    record.shape == Shape::Box
-        && record.flags == Flags::default()
-        && sigmas.iter().all(|s| *s <= SIGMA_MAX_MM)
-}
-
 fn sigmas_mm(record: &ParcelRecord) -> [f64; 3] {
     [record.sigma_length_mm, record.sigma_width_mm, record.sigma_height_mm]
 }
@@ -98,7 +89,7 @@ pub fn judge(scenario: &Scenario, records: &[ParcelRecord]) -> Verdict {
             told[n].push(record);
         } else {
             verdict.false_records += 1;
-            verdict.silent += usize::from(may_be_used(record));
+            verdict.silent += usize::from(record.may_be_used);
         }
     }
     for (truth, told) in parcels.iter().zip(&told) {
@@ -107,7 +98,7 @@ pub fn judge(scenario: &Scenario, records: &[ParcelRecord]) -> Verdict {
             1 => verdict.once += 1,
             _ => verdict.twice += 1,
         }
-        for record in told.iter().filter(|r| may_be_used(r)) {
+        for record in told.iter().filter(|r| r.may_be_used) {
             let errors = errors_mm(record, truth);
             let mut pairs = errors.iter().zip(sigmas_mm(record));
             let wrong = pairs.any(|(e, s)| e.abs() > WRONG_MM && e.abs() > 3.0 * s);
