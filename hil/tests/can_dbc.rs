@@ -53,6 +53,7 @@ fn cantools_reads_a_parcel_from_segments_and_from_one_can_fd_frame() {
         belt_travel_mm: 171_234.5,
         by_encoder: true,
         flags,
+        may_be_used: false,
         ..record(70_123)
     };
     for fd in [false, true] {
@@ -68,7 +69,7 @@ fn cantools_reads_a_parcel_from_segments_and_from_one_can_fd_frame() {
         is(&signals, "y", -240.3);
         is(&signals, "sigma_height", 0.5);
         is(&signals, "belt_travel", 171_234.5);
-        is(&signals, "valid", 7.0);
+        is(&signals, "valid", 14.0);
         is(&signals, "flags", 4.0);
     }
 }
