@@ -6,6 +6,10 @@ use std::sync::atomic::{AtomicU32, AtomicU64, Ordering};
 use std::time::Instant;
 use tokio::task::AbortHandle;
 
+/// Clients that have not asked yet, beside `modbus.connections_max` that have: at 100 connects a second
+/// each has more than a second for its first request.
+const STRANGERS_MAX: usize = 128;
+
 /// What a client has asked for.
 #[derive(Debug, Default)]
 pub(super) struct Asked {
@@ -22,14 +26,17 @@ fn now_ms() -> u64 {
 }
 
 impl Asked {
-    /// It has sent a whole request.
-    pub(super) fn note(&self) {
-        self.requests.fetch_add(1, Ordering::Relaxed);
+    /// It has sent a whole request. Whether that was its first.
+    pub(super) fn note(&self) -> bool {
         self.last_ms.store(now_ms(), Ordering::Relaxed);
+        self.requests.fetch_add(1, Ordering::Relaxed) == 0
     }
 
-    /// The least is the first to go. Who has never asked is a stranger; who has asked once may be one;
-    /// among equals the one silent for longest.
+    fn is_stranger(&self) -> bool {
+        self.requests.load(Ordering::Relaxed) == 0
+    }
+
+    /// The least is the first to go: who has asked only once, then who is silent for longest.
     fn standing(&self) -> (u32, u64) {
         (self.requests.load(Ordering::Relaxed).min(2), self.last_ms.load(Ordering::Relaxed))
     }
@@ -38,6 +45,7 @@ impl Asked {
 /// The connected clients.
 #[derive(Debug)]
 pub(super) struct Clients {
+    /// Of those who have asked.
     max: usize,
     connected: Vec<(Arc<Asked>, AbortHandle)>,
 }
@@ -45,21 +53,35 @@ pub(super) struct Clients {
 impl Clients {
     /// None yet.
     pub(super) fn new(max: usize) -> Self {
-        Self { max, connected: Vec::with_capacity(max) }
+        Self { max, connected: Vec::with_capacity(max + STRANGERS_MAX) }
     }
 
-    /// Take a client in. One too many takes the place of the least in standing, so that a PLC that has
-    /// been restarted gets in, whatever it left half-open before.
+    /// Take a stranger in. One too many takes the place of the one that has waited for longest.
     pub(super) fn admit(&mut self, asked: Arc<Asked>, connection: AbortHandle) {
         asked.last_ms.store(now_ms(), Ordering::Relaxed);
         self.connected.retain(|(_, connection)| !connection.is_finished());
-        if self.connected.len() >= self.max {
-            let standing = |i: &usize| self.connected[*i].0.standing();
-            if let Some(least) = (0..self.connected.len()).min_by_key(standing) {
-                self.connected.swap_remove(least).1.abort();
-            }
-        }
+        self.limit(STRANGERS_MAX - 1, |client| client.is_stranger());
         self.connected.push((asked, connection));
+    }
+
+    /// A client has asked for the first time. One too many takes the place of the least in standing, so
+    /// that a PLC that has been restarted gets in, whatever it left half-open before.
+    pub(super) fn has_asked(&mut self, asked: &Arc<Asked>) {
+        self.connected.retain(|(_, connection)| !connection.is_finished());
+        self.limit(self.max - 1, |client| !client.is_stranger() && !std::ptr::eq(client, &**asked));
+    }
+
+    /// Disconnect some of a kind, until so many are left.
+    fn limit(&mut self, left: usize, is_of_kind: impl Fn(&Asked) -> bool) {
+        loop {
+            let of_kind = (0..self.connected.len()).filter(|&i| is_of_kind(&self.connected[i].0));
+            if of_kind.clone().count() <= left {
+                return;
+            }
+            let least = of_kind.min_by_key(|&i| self.connected[i].0.standing());
+            let Some(least) = least else { return };
+            self.connected.swap_remove(least).1.abort();
+        }
     }
 }
 
@@ -69,7 +91,7 @@ mod tests {
 
     /// Let every aborted task end.
     async fn settle() {
-        for _ in 0..200 {
+        for _ in 0..2000 {
             tokio::task::yield_now().await;
         }
     }
@@ -83,22 +105,31 @@ mod tests {
             let mut admit = |requests: u32| {
                 let (asked, task) = (Arc::new(Asked::default()), task());
                 clients.admit(Arc::clone(&asked), task.abort_handle());
-                (0..requests).for_each(|_| asked.note());
+                for _ in 0..requests {
+                    if asked.note() {
+                        clients.has_asked(&asked);
+                    }
+                }
                 task
             };
             let (plc, panel) = (admit(10), admit(2));
+            let new_plc = admit(0);
             let curious: Vec<_> = (0..50).map(|_| admit(1)).collect();
-            let strangers: Vec<_> = (0..50).map(|_| admit(0)).collect();
+            let strangers: Vec<_> = (0..100).map(|_| admit(0)).collect();
             settle().await;
-            assert!(!plc.is_finished() && !panel.is_finished());
             let left = |tasks: &[tokio::task::JoinHandle<()>]| {
                 tasks.iter().filter(|task| !task.is_finished()).count()
             };
-            assert_eq!((left(&curious), left(&strangers)), (1, 1));
+            assert!(!plc.is_finished() && !panel.is_finished());
+            assert!(!new_plc.is_finished(), "it has not asked yet");
+            assert_eq!((left(&curious), left(&strangers)), (2, 100));
+            let more: Vec<_> = (0..1000).map(|_| admit(0)).collect();
+            settle().await;
+            assert_eq!(left(&strangers) + left(&more) + left(&[new_plc]), STRANGERS_MAX);
             // All have asked: the one silent for longest goes.
             let others: Vec<_> = (0..3).map(|_| admit(2)).collect();
             settle().await;
-            assert!(left(&others) == 3 && left(&[plc, panel]) == 1);
+            assert!(left(&others) == 3 && left(&[plc, panel]) == 1 && left(&curious) == 0);
         });
     }
 }

@@ -1,6 +1,6 @@
 //! Modbus TCP server: `tokio-modbus` behind the guard, reading the register image.
 //!
-//! In: the link. Out: registers to clients, `modbus.connections_max` at once; those that `modbus.allow`
+//! In: the link. Out: registers to clients, `modbus.connections_max` that ask at once; those that `modbus.allow`
 //! does not name are turned away, and only those that `modbus.write_allow` names may write. A write is
 //! answered when the disk has what it changed. Runs on its own thread; nothing here can block the
 //! vision thread.
@@ -80,7 +80,7 @@ pub fn serve(
 /// Accept clients for ever; a failing listener is tried again.
 async fn accept(listener: tokio::net::TcpListener, settings: Settings, link: SharedLink) {
     let server = tokio_modbus::server::tcp::Server::new(listener);
-    let clients = Mutex::new(Clients::new(settings.connections_max));
+    let clients = Arc::new(Mutex::new(Clients::new(settings.connections_max)));
     let connects = Arc::new(Mutex::new(LogLimit::default()));
     let refused_writes = Arc::new(Mutex::new(LogLimit::default()));
     let on_connected = |stream: TcpStream, address: SocketAddr| {
@@ -101,8 +101,12 @@ async fn accept(listener: tokio::net::TcpListener, settings: Settings, link: Sha
         let (library_end, guard_end) = tokio::io::duplex(PIPE_BYTES);
         let asked = Arc::new(Asked::default());
         let note_request = {
-            let asked = Arc::clone(&asked);
-            move || asked.note()
+            let (asked, clients) = (Arc::clone(&asked), Arc::clone(&clients));
+            move || {
+                if asked.note() {
+                    lock(&clients).has_asked(&asked);
+                }
+            }
         };
         let connection = tokio::spawn(async move {
             if !allowed {
