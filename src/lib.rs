@@ -40,3 +40,15 @@ pub mod source;
 pub mod stage;
 pub mod store;
 pub mod units;
+
+/// What `hil/fuzz` feeds with any bytes, and nobody else calls from outside.
+#[doc(hidden)]
+pub mod fuzz {
+    pub use crate::plc::journal::slots::parse as parse_journal;
+    pub use crate::run::calibrate::parse_points;
+    pub use crate::run::import::Board;
+    pub use crate::source::gige::assembly::{Assembly, RANGES};
+    pub use crate::source::gige::features::describe;
+    pub use crate::source::pixels::{PixelFormat, by_genicam};
+    pub use crate::source::still::decode;
+}

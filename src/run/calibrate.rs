@@ -360,12 +360,16 @@ fn save_belt(
     .save(out, "beltgauge calibrate belt")
 }
 
-/// Lines of X, Y, Z in mm and u, v in px, separated by commas or semicolons; a first line of
-/// names, empty lines and lines that start with # are passed over.
 fn read_points(path: &Path) -> Result<Vec<SurveyedPoint>> {
     let text = std::fs::read_to_string(path).map_err(|e| {
         Error::configuration(format!("cannot read the surveyed points: {e}")).in_file(path)
     })?;
+    parse_points(&text, path)
+}
+
+/// Lines of X, Y, Z in mm and u, v in px, separated by commas or semicolons; a first line of
+/// names, empty lines and lines that start with # are passed over. `path` is for error texts.
+pub fn parse_points(text: &str, path: &Path) -> Result<Vec<SurveyedPoint>> {
     let mut points = Vec::new();
     let mut is_first = true;
     for (number, line) in text.lines().enumerate() {

@@ -26,7 +26,7 @@ const RESULT_BYTES_MAX: u64 = 64 << 20;
 /// `calibration.toml` on the stick: the board of the stills in `lens/` and `belt/`.
 #[derive(Debug, Deserialize)]
 #[serde(deny_unknown_fields)]
-struct Board {
+pub struct Board {
     /// Inner corners along both sides.
     board: [usize; 2],
     square_mm: f64,
@@ -41,7 +41,8 @@ fn brown() -> LensModel {
 }
 
 impl Board {
-    fn parse(text: &str) -> Result<Self> {
+    /// Parse and check.
+    pub fn parse(text: &str) -> Result<Self> {
         let board: Self = toml::from_str(text).map_err(|e| {
             Error::configuration(e.to_string().trim_end().to_owned())
                 .allowed("board = [9, 6], square_mm = 25, board_thickness_mm, model")

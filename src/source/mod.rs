@@ -5,10 +5,10 @@ mod aravis;
 mod directory;
 mod fault_injector;
 mod feed;
-mod gige;
-mod pixels;
+pub(crate) mod gige;
+pub(crate) mod pixels;
 mod repeats;
-mod still;
+pub(crate) mod still;
 pub mod synthetic;
 #[cfg(feature = "v4l2")]
 mod v4l2;

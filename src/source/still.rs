@@ -99,7 +99,8 @@ fn check_pixels([width, height]: [u64; 2]) -> Result<()> {
         .remedy("use images as the camera delivers them"))
 }
 
-fn decode(file: impl BufRead + Seek) -> Result<Still> {
+/// Decode an image of any of the formats, up to [`PIXELS_MAX`].
+pub fn decode(file: impl BufRead + Seek) -> Result<Still> {
     let mut decoder = reader(file)?.into_decoder().map_err(unreadable)?;
     let (width, height) = decoder.dimensions();
     check_pixels([width.into(), height.into()])?;

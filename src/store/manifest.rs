@@ -55,7 +55,12 @@ impl Manifest {
         let signature = Signature::decode(&String::from_utf8_lossy(signature))
             .map_err(|e| refused(e.to_string()))?;
         key.verify(text, &signature, false).map_err(|e| refused(e.to_string()))?;
-        let manifest: Self = toml::from_str(&String::from_utf8_lossy(text)).map_err(|e| {
+        Self::parse(&String::from_utf8_lossy(text))
+    }
+
+    /// Parse and check.
+    pub fn parse(text: &str) -> Result<Self> {
+        let manifest: Self = toml::from_str(text).map_err(|e| {
             Error::configuration(format!("no manifest: {}", e.to_string().trim_end()))
                 .remedy("make it with `beltgauge manifest`")
         })?;

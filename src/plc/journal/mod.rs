@@ -11,7 +11,7 @@
 //! Cost: one wait for the disk and two blocks written a parcel, and the same for an acknowledgment. A
 //! parcel a second, each acknowledged, is 63 million commits or 0.5 TB in blocks of 4 KiB a year.
 
-mod slots;
+pub(crate) mod slots;
 mod writer;
 
 pub use slots::{Override, State};

@@ -45,7 +45,7 @@ enum Request {
 }
 
 /// Bytes that were read, or why they were not.
-type Answer = std::result::Result<Vec<u8>, String>;
+pub type Answer = std::result::Result<Vec<u8>, String>;
 
 /// The child that knows the features of one camera.
 pub struct Features {
@@ -134,9 +134,10 @@ pub fn serve() -> Result<()> {
     let mut camera = None;
     while let Some(order) = pipe.receive::<Order>()? {
         let result = match (order, &mut camera) {
-            (Order::Describe, camera) => describe(&pipe).map(|map| {
-                *camera = Some(Camera::new(&pipe, map));
-            }),
+            (Order::Describe, camera) => describe(|address, length| pipe.read_all(address, length))
+                .map(|map| {
+                    *camera = Some(Camera::new(&pipe, map));
+                }),
             (_, None) => Err("no description yet".to_owned()),
             (Order::Set { name, value }, Some(camera)) => {
                 camera.set(&name, &value).map_err(|e| e.to_string())
@@ -150,9 +151,10 @@ pub fn serve() -> Result<()> {
     Ok(())
 }
 
-fn describe(pipe: &Pipe) -> std::result::Result<NodeMap, String> {
-    let fetch = viva_genapi_xml::fetch_and_load_xml(|address, length| async move {
-        pipe.read_all(address, length).map_err(viva_genapi_xml::XmlError::transport)
+/// Fetch and parse the description of the camera whose memory `read_all` reads.
+pub fn describe(read_all: impl Fn(u64, usize) -> Answer) -> std::result::Result<NodeMap, String> {
+    let fetch = viva_genapi_xml::fetch_and_load_xml(|address, length| {
+        std::future::ready(read_all(address, length).map_err(viva_genapi_xml::XmlError::transport))
     });
     let runtime = tokio::runtime::Builder::new_current_thread().build();
     let xml = runtime.map_err(|e| e.to_string())?.block_on(fetch).map_err(|e| e.to_string())?;

@@ -4,7 +4,7 @@
 //! child process (`features`). Frames are put together in `assembly`, which asks again for packets
 //! that are missing. After opening, nothing is allocated for a frame.
 
-mod assembly;
+pub(crate) mod assembly;
 mod control;
 pub mod features;
 

@@ -8,6 +8,9 @@ use crate::camera::{Camera, CameraFile};
 use crate::error::{Error, Result};
 use serde::Deserialize;
 
+/// Random parcels: a day at one a second.
+const RANDOM_PARCELS_MAX: usize = 100_000;
+
 /// A synthetic sequence.
 #[derive(Clone, Debug, Deserialize)]
 #[serde(deny_unknown_fields)]
@@ -229,6 +232,10 @@ impl Scenario {
             ));
         }
         if let Some(random) = scenario.random.take() {
+            if random.count > RANDOM_PARCELS_MAX {
+                return Err(Error::configuration(format!("random.count = {}", random.count))
+                    .allowed(format!("up to {RANDOM_PARCELS_MAX} parcels")));
+            }
             let mut generator = Random(scenario.seed);
             scenario.parcels.extend(random.draw(&mut generator));
         }
@@ -325,6 +332,17 @@ impl RandomTable {
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn more_random_parcels_than_memory_holds_are_refused() {
+        let demo = include_str!("../../../config/demo/scenario.toml");
+        let parse = |count: &str| Scenario::parse(&demo.replace("count = 500", count));
+        assert_eq!(parse("count = 100000").expect("a day").parcels().len(), 100_000);
+        for count in ["count = 100001", "count = 9223372036854775807"] {
+            let error = parse(count).expect_err(count).to_string();
+            assert!(error.contains("random.count = ") && error.contains("100000"), "{error}");
+        }
+    }
 
     #[test]
     fn a_stop_costs_its_standstill_and_one_ramp() {
