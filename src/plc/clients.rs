@@ -60,7 +60,7 @@ impl Clients {
     pub(super) fn admit(&mut self, asked: Arc<Asked>, connection: AbortHandle) {
         asked.last_ms.store(now_ms(), Ordering::Relaxed);
         self.connected.retain(|(_, connection)| !connection.is_finished());
-        self.limit(STRANGERS_MAX - 1, |client| client.is_stranger());
+        self.limit(STRANGERS_MAX - 1, Asked::is_stranger);
         self.connected.push((asked, connection));
     }
 
@@ -68,7 +68,8 @@ impl Clients {
     /// that a PLC that has been restarted gets in, whatever it left half-open before.
     pub(super) fn has_asked(&mut self, asked: &Arc<Asked>) {
         self.connected.retain(|(_, connection)| !connection.is_finished());
-        self.limit(self.max - 1, |client| !client.is_stranger() && !std::ptr::eq(client, &**asked));
+        let is_other = |client: &Asked| !std::ptr::eq(client, Arc::as_ptr(asked));
+        self.limit(self.max - 1, |client| !client.is_stranger() && is_other(client));
     }
 
     /// Disconnect some of a kind, until so many are left.
