@@ -278,12 +278,16 @@ fn main() -> ExitCode {
     let level = if matches!(cli.command, Command::Run { .. }) { Level::INFO } else { Level::WARN };
     // A sandbox's standard error says how it ended.
     let is_sandbox = matches!(cli.command, Command::Sandbox { .. });
+    // Before any thread is started: the kernel knows users of threads only.
+    if let Err(error) = cli.user.map_or(Ok(()), privileges::become_user) {
+        let _ = writeln!(std::io::stderr(), "error: {error}");
+        return ExitCode::from(error.exit_status());
+    }
     let log = (!is_sandbox).then(|| log::start(level, cli.log));
     if is_appliance {
         run::end_on_panic();
     }
-    let user = cli.user.map_or(Ok(()), privileges::become_user);
-    let ended = user.and_then(|()| dispatch(cli.command));
+    let ended = dispatch(cli.command);
     let status = match ended {
         Ok(()) => ExitCode::SUCCESS,
         Err(error) => {

@@ -22,6 +22,8 @@ pub const SUBCOMMAND: &str = "sandbox";
 pub const LINE_BYTES_MAX: usize = 64 << 10;
 /// Processor time of a child: one that nobody waits for any more ends by itself.
 const PROCESSOR_S: u64 = 60;
+/// A child that has closed its end of the socket ends within this, or is ended.
+const FAREWELL: Duration = Duration::from_secs(2);
 /// What a child says as it dies is told up to this length.
 const LAST_WORDS_MAX: usize = 300;
 /// This very program, also when its file has been replaced by an update.
@@ -156,6 +158,12 @@ impl Sandbox {
         if late || why == ErrorKind::InvalidData {
             let _ = self.child.kill();
         }
+        // One that has closed its end need not have ended.
+        let begun = Instant::now();
+        while matches!(self.child.try_wait(), Ok(None)) && begun.elapsed() < FAREWELL {
+            std::thread::sleep(Duration::from_millis(5));
+        }
+        let _ = self.child.kill();
         let status = self.child.wait().map_or_else(|e| e.to_string(), |status| status.to_string());
         let mut said = Vec::new();
         if let Some(words) = self.last_words.take() {

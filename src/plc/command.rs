@@ -23,7 +23,7 @@ pub const COMMANDS: [(u16, &str); 6] = [
     (5, "round dimensions to multiples of `argument` tenths of a mm, 1 to 500"),
     (
         6,
-        "correct the encoder's scale by the belt's texture: mm_per_count becomes mm_per_count_seen, for good",
+        "correct the encoder's scale by the belt's texture: mm_per_count becomes mm_per_count_seen, for good; refused when they differ by more than 40 %",
     ),
 ];
 

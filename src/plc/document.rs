@@ -29,7 +29,7 @@ pub fn markdown() -> String {
          [registers.csv](registers.csv). The same over CAN: [beltgauge.dbc](beltgauge.dbc). Examples:\n\
          [plc.st](plc.st) (IEC 61131-3 Structured Text).\n\n\
          Map version {}. Modbus TCP, any unit identifier. Function codes 3 (holding) and 4 (input)\n\
-         read the same {COUNT} registers, at most 125 at once; 6 and 16 write the {COMMAND_COUNT} registers from {COMMAND} on,\n\
+         read the same {COUNT} registers, at most 125 at once; 6, 16 and 23 write the {COMMAND_COUNT} registers from {COMMAND} on,\n\
          elsewhere writes get exception 2; 1 (coils) and 2 (discrete inputs) read 32 bits: the 16 of\n\
          `status` from 0 on, the 16 of `fault` from 16 on; 43/14 identifies the device. All others: exception 1.\n\
          Addresses start at 0, or at `modbus.base_address`: decimal address 100 is 0x0064, holding register 40101\n\

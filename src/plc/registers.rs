@@ -81,6 +81,9 @@ pub struct VisionStatus {
     pub belt: BeltStatus,
 }
 
+/// Ratios that command 6 corrects.
+const ENCODER_RATIOS: std::ops::RangeInclusive<f64> = 0.7..=1.4;
+
 /// What the pictures show of the belt, and what disagrees with it.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
 #[allow(clippy::struct_excessive_bools)] // they become bits
@@ -204,6 +207,11 @@ impl Status {
     pub fn mm_per_count_seen(&self) -> Option<f64> {
         let ratio = self.vision.belt.encoder_ratio.filter(|ratio| *ratio > 0.0)?;
         Some(self.mm_per_count? / ratio)
+    }
+
+    /// Whether the encoder's scale is off by no more than what a wrong scale explains.
+    pub fn encoder_scale_is_plausible(&self) -> bool {
+        self.vision.belt.encoder_ratio.is_some_and(|ratio| ENCODER_RATIOS.contains(&ratio))
     }
 
     fn overflows(&self) -> u64 {

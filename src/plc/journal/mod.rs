@@ -102,9 +102,11 @@ impl Journal {
         self.state.sequence = newest.unwrap_or(self.state.sequence);
         let age = |number: u32| self.state.sequence.wrapping_sub(number);
         let mut records = found.records;
-        records.retain(|record| age(record.seq) < QUEUE_PARCELS as u32);
-        records.sort_by_key(|record| std::cmp::Reverse(age(record.seq)));
-        for record in records {
+        records.retain(|record| age(record.seq) < u32::MAX / 2);
+        records.sort_by_key(|record| age(record.seq));
+        // The newest, also when the disk failed in between and they are of two blocks.
+        records.truncate(QUEUE_PARCELS);
+        for record in records.into_iter().rev() {
             let _ = self.records.push_back(record); // invariant: no more than there is room for
         }
         for number in found.unknown.iter().filter(|n| age(**n) < QUEUE_PARCELS as u32) {
@@ -213,11 +215,12 @@ impl Drop for Journal {
 /// Parcels that a commit may write before the state that counts them, and one.
 const AHEAD_MAX: u32 = QUEUE_PARCELS as u32 + 1;
 
-/// Another block of 2^16 numbers, drawn at random, half a turn away in its low word: an
+/// Another block of 2^16 numbers further on, drawn at random, half a turn away in its low word: an
 /// acknowledgment, which is a low word, is of one block or the other and never of both.
 fn another_block(sequence: u32) -> u32 {
-    let high = RandomState::new().hash_one(Instant::now()) as u32 | 1;
-    sequence ^ (high << 16 | 0x8000)
+    let random = RandomState::new().hash_one(Instant::now()) as u32;
+    // Less than half of all numbers on, so that what comes later is later.
+    sequence.wrapping_add((1 + random % 0x3fff) << 16) ^ 0x8000
 }
 
 /// A file, if it may be written, and what it holds.
@@ -282,6 +285,7 @@ fn prepare(path: &Path, file: File) -> Opened {
         );
         std::fs::rename(path, aside)?;
         let file = open_for_writing(path)?;
+        file.try_lock()?;
         slots::allocate(&file)?;
         return Ok((Some(file), found));
     }

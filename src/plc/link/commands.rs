@@ -171,6 +171,10 @@ impl Link {
             }
             5 => (Outcome::Argument, None),
             6 => match (self.configured_mm_per_count, self.status.mm_per_count_seen()) {
+                // An encoder that slips or stands is not one whose scale is off.
+                (Some(_), Some(_)) if !self.status.encoder_scale_is_plausible() => {
+                    (Outcome::Argument, None)
+                }
                 (Some(configured), Some(set)) => {
                     self.journal.change(|state| {
                         state.mm_per_count = Some(Override { configured, set });

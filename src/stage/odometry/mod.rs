@@ -233,6 +233,8 @@ impl Odometry {
         };
         self.key_age_s += dt_s;
         let found = self.search(last_px, dt_s);
+        // A search far off may have found that the steps before were assumed wrongly.
+        let last_px = self.shift_px.unwrap_or(last_px);
         let found = found.filter(|m| !self.refutes(ride, (m.shift_px - last_px) / dt_s));
         self.locked = found.is_some();
         let assumed_px = assumed_mm_per_s * dt_s / self.mm_per_px;
