@@ -125,7 +125,13 @@ impl Drop for Aravis {
 /// How many frames `id` is after `last`; numbers of 16 bits go from 65535 to 1.
 fn frames_ahead(id: u64, last: u64) -> i64 {
     let ahead = id.wrapping_sub(last) as i64;
-    if id.max(last) <= 65_535 && ahead < -32_767 { ahead + 65_535 } else { ahead }
+    match ahead {
+        _ if id.max(last) > 65_535 => ahead,
+        ..-32_767 => ahead + 65_535,
+        // A torn frame from before the wrap.
+        32_768.. => ahead - 65_535,
+        _ => ahead,
+    }
 }
 
 fn set_features(
