@@ -154,10 +154,10 @@ fn fifty_full_disks_lose_no_parcel_and_give_no_number_twice() {
 }
 
 /// What was published while nothing could be written is gone with the process, and what was acknowledged
-/// then may come again, with its number. No number is given to another parcel.
+/// then may come again, with its number. A parcel that the disk took just before it failed, unknown to
+/// us, may come again with another number. No number is given to another parcel: asked in each cycle.
 #[test]
 fn fifty_failing_disks_give_no_number_twice() {
     let plc = kills("failing", 50, Some(0));
-    none_has_two_numbers(&plc);
     assert!(plc.parcel_of.keys().any(|number| *number > 0xffff), "no disk has failed");
 }
