@@ -16,6 +16,8 @@ pub(super) struct Asked {
     requests: AtomicU32,
     /// When it asked last, ms since the first client.
     last_ms: AtomicU64,
+    /// It is named in the configuration as one that writes: the PLC itself.
+    may_write: bool,
 }
 
 /// Time counts from the first client on.
@@ -26,6 +28,11 @@ fn now_ms() -> u64 {
 }
 
 impl Asked {
+    /// Nothing yet.
+    pub(super) fn new(may_write: bool) -> Self {
+        Self { may_write, ..Self::default() }
+    }
+
     /// It has sent a whole request. Whether that was its first.
     pub(super) fn note(&self) -> bool {
         self.last_ms.store(now_ms(), Ordering::Relaxed);
@@ -36,9 +43,11 @@ impl Asked {
         self.requests.load(Ordering::Relaxed) == 0
     }
 
-    /// The least is the first to go: who has asked only once, then who is silent for longest.
-    fn standing(&self) -> (u32, u64) {
-        (self.requests.load(Ordering::Relaxed).min(2), self.last_ms.load(Ordering::Relaxed))
+    /// The least is the first to go: who may not write, who has asked only once, who is silent for
+    /// longest.
+    fn standing(&self) -> (bool, u32, u64) {
+        let requests = self.requests.load(Ordering::Relaxed).min(2);
+        (self.may_write, requests, self.last_ms.load(Ordering::Relaxed))
     }
 }
 
@@ -95,6 +104,16 @@ mod tests {
         for _ in 0..2000 {
             tokio::task::yield_now().await;
         }
+    }
+
+    #[test]
+    fn a_client_that_may_write_goes_last_however_seldom_it_asks() {
+        let (plc, stranger) = (Asked::new(true), Asked::new(false));
+        plc.note();
+        for _ in 0..9 {
+            stranger.note();
+        }
+        assert!(plc.standing() > stranger.standing());
     }
 
     #[test]

@@ -99,7 +99,7 @@ async fn accept(listener: tokio::net::TcpListener, settings: Settings, link: Sha
             refused_writes: Arc::clone(&refused_writes),
         };
         let (library_end, guard_end) = tokio::io::duplex(PIPE_BYTES);
-        let asked = Arc::new(Asked::default());
+        let asked = Arc::new(Asked::new(may_write(&settings.write_allow, address.ip())));
         let note_request = {
             let (asked, clients) = (Arc::clone(&asked), Arc::clone(&clients));
             move || {

@@ -150,9 +150,9 @@ impl Store {
         let in_force = match files::read(&path, TEXT_BYTES_MAX) {
             Err(e) if e.kind() == ErrorKind::NotFound => Ok(None),
             Err(e) => Err(unreadable(&path, &e)),
-            Ok(bytes) => Config::parse(&String::from_utf8_lossy(&bytes))
-                .map(|config| config.import.public_key)
-                .map_err(|e| e.in_file(&path)),
+            Ok(bytes) => {
+                public_key_of(&String::from_utf8_lossy(&bytes)).map_err(|e| e.in_file(&path))
+            }
         };
         match (in_force, kept) {
             (Ok(public_key), kept) => {
@@ -234,4 +234,34 @@ fn text_of(path: &Path) -> Result<String> {
         .map_err(|e| unreadable(path, &e).remedy("import a configuration"))?;
     String::from_utf8(bytes)
         .map_err(|e| Error::configuration(format!("not UTF-8 text: {e}")).in_file(path))
+}
+/// The key of a configuration, also of one that another version of the program has written: what else
+/// is in it does not matter here.
+fn public_key_of(text: &str) -> Result<Option<String>> {
+    let table: toml::Table = text
+        .parse()
+        .map_err(|e: toml::de::Error| Error::configuration(e.to_string().trim_end().to_owned()))?;
+    match table.get("import").and_then(|import| import.get("public_key")) {
+        None => Ok(None),
+        Some(toml::Value::String(key)) => Ok(Some(key.clone())),
+        Some(other) => Err(Error::configuration(format!("import.public_key = {other}"))
+            .allowed("the last line of minisign's .pub file, as a text")),
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_key_is_read_from_a_configuration_that_this_version_refuses() {
+        let key = |text: &str| public_key_of(text).map_err(|e| e.to_string());
+        assert_eq!(
+            key("[plc]\nunknown = 1\n[import]\npublic_key = \"RWQ\"\n"),
+            Ok(Some("RWQ".into()))
+        );
+        assert_eq!(key("[plc]\nqueue = true\n"), Ok(None));
+        assert!(key("[import]\npublic_key = 5\n").is_err_and(|e| e.contains("import.public_key")));
+        assert!(key("[import\n").is_err(), "damaged: not known");
+    }
 }

@@ -58,6 +58,8 @@ pub struct Link {
     unpublished: u64,
     counts: Deque<(u32, Instant), COUNTS_MAX>,
     requests: Deque<Request, REQUESTS_MAX>,
+    /// Vision still shows the ratio of the scale before the last command 6.
+    ratio_is_old: bool,
     /// Of the last acknowledgment, for [`Link::is_kept`].
     acknowledgment: u64,
     plc_alive: Instant,
@@ -118,6 +120,7 @@ impl Link {
             unpublished: 0,
             counts: Deque::new(),
             requests: Deque::new(),
+            ratio_is_old: false,
             acknowledgment: 0,
             plc_alive: now,
             encoder_alive: None,
@@ -191,6 +194,11 @@ impl Link {
         self.publish_kept();
         let status = &mut self.status;
         (status.vision, status.can) = (*vision, *can);
+        // It is forgotten by vision when the new scale has arrived there.
+        self.ratio_is_old &= vision.belt.encoder_ratio.is_some();
+        if self.ratio_is_old {
+            status.vision.belt.encoder_ratio = None;
+        }
         status.can.parcels_dropped += self.unsent;
         status.vision.counters.event_overflows += self.unpublished;
         status.keeping = self.journal.keeping();
@@ -276,7 +284,7 @@ impl Link {
         if let Some(request) = decided.request {
             if let Request::MmPerCount(set) = request {
                 self.status.mm_per_count = Some(set);
-                // The ratio that was known was that of the scale before.
+                self.ratio_is_old = true;
                 self.status.vision.belt.encoder_ratio = None;
             }
             let _ = self.requests.push_back(request); // invariant: room was asked for

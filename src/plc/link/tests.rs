@@ -288,6 +288,10 @@ fn the_encoder_s_scale_is_corrected_by_the_belt_and_stays_so() {
     let noted = link.command(2, 6, 0, SENDER).noted;
     wait_until_kept(&mut link, noted);
     assert_eq!(link.next_request(), Some(Request::MmPerCount(0.04)));
+    // Vision has not heard of it yet: the old ratio does not correct twice.
+    link.update(&vision, &CanStatus::default(), None, Instant::now());
+    assert_eq!(link.command(3, 6, 0, SENDER).outcome, Outcome::NotKnown as u16);
+    link.flush();
     drop(link);
     let mut link = on_disk(&path, Settings::default()).with_encoder(Some(0.05));
     assert_eq!(link.next_request(), Some(Request::MmPerCount(0.04)));
