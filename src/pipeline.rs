@@ -84,7 +84,7 @@ impl Pipeline {
         Background::plan(size, plan);
         Odometry::plan(&site.view, &site.config.zone, plan);
         Segment::plan(size, limits, plan);
-        Riders::plan(size, plan);
+        Riders::plan(size, limits.blobs_max, plan);
         Tracker::plan(limits.tracks_max, limits.blobs_max, plan);
         Measure::plan(limits.tracks_max, limits.views_per_track_max, plan);
         let mask = words(size[0]) * size[1];
@@ -183,7 +183,7 @@ impl Pipeline {
         let background = &self.background;
         self.segment.step(background.foreground(), background.strong(), background.dark());
         self.cover();
-        self.riders.step(self.segment.runs(), dt_s);
+        self.riders.step(self.segment.runs(), self.rectify.seen(), dt_s);
         let ride = self.riders.ride();
         let grey = self.rectify.pixels();
         let texture = self.odometry.step(grey, &self.background, &self.covered, ride, dt_s);

@@ -4,9 +4,11 @@
 //! Owns: two profiles, the foreground pixels of each column. All motion is along rows, so the shift
 //! that lays one profile on the other is the motion. Tops move faster than the belt, by up to the
 //! view's magnification, so this witness cannot measure; it refutes, and it bridges.
+//! What reaches beyond the picture does not count: an end that the picture cuts off does not move.
 //! Cost: two thirds of the columns squared, in additions.
 
 use crate::error::Result;
+use crate::kernel::scalar::bits::{self, words};
 use crate::kernel::scalar::runs::Run;
 use crate::plan::{Block, Memory, Plan};
 
@@ -41,6 +43,8 @@ pub enum Ride {
 /// The stage.
 pub struct Riders {
     mm_per_px: f64,
+    /// By label: the picture's border cuts this silhouette off.
+    cut: Block<bool>,
     profile: Block<i32>,
     last: Block<i32>,
     speed_px_per_s: f64,
@@ -50,7 +54,8 @@ pub struct Riders {
 
 impl Riders {
     /// Memory for a view.
-    pub fn plan([width, _]: [usize; 2], plan: &mut Plan) {
+    pub fn plan([width, _]: [usize; 2], blobs_max: usize, plan: &mut Plan) {
+        plan.add::<bool>("riders.cut", blobs_max, "limits.blobs_max");
         plan.add::<i32>("riders.profile", width + 1, "foreground pixels of each column");
         plan.add::<i32>("riders.last", width + 1, "the same of the last frame");
     }
@@ -59,6 +64,7 @@ impl Riders {
     pub fn new(mm_per_px: f64, memory: &mut Memory) -> Result<Self> {
         Ok(Self {
             mm_per_px,
+            cut: memory.take("riders.cut", false)?,
             profile: memory.take("riders.profile", 0)?,
             last: memory.take("riders.last", 0)?,
             speed_px_per_s: 0.0,
@@ -67,10 +73,11 @@ impl Riders {
         })
     }
 
-    /// One frame, `dt_s` after the last one.
-    pub fn step(&mut self, runs: &[Run], dt_s: f64) {
+    /// One frame, `dt_s` after the last one. `seen`: bit mask of what the camera sees.
+    pub fn step(&mut self, runs: &[Run], seen: &[u64], dt_s: f64) {
         std::mem::swap(&mut self.profile, &mut self.last);
-        fill(&mut self.profile, runs);
+        self.cut_off(runs, seen);
+        fill(&mut self.profile, runs, &self.cut);
         let area_min_px = AREA_MIN_MM2 / (self.mm_per_px * self.mm_per_px);
         let area_px = |profile: &[i32]| profile.iter().map(|&n| f64::from(n)).sum::<f64>();
         if dt_s <= 0.0 || area_px(&self.profile).min(area_px(&self.last)) < area_min_px {
@@ -101,6 +108,22 @@ impl Riders {
         }
     }
 
+    /// Find the silhouettes that reach beyond what the camera sees along the travel.
+    fn cut_off(&mut self, runs: &[Run], seen: &[u64]) {
+        let width = self.profile.len() - 1;
+        let n = words(width);
+        self.cut.fill(false);
+        for run in runs {
+            let row = &seen[usize::from(run.v) * n..][..n];
+            let (start, end) = (usize::from(run.start), usize::from(run.end));
+            let ends_inside =
+                start > 0 && bits::get(row, start - 1) && end < width && bits::get(row, end);
+            if let Some(cut) = self.cut.get_mut(run.label as usize) {
+                *cut |= !ends_inside;
+            }
+        }
+    }
+
     /// What the last frames agree on.
     pub fn ride(&self) -> Ride {
         if self.moving_frames >= MOVING_FRAMES {
@@ -118,10 +141,11 @@ impl Riders {
     }
 }
 
-/// Foreground pixels of each column.
-fn fill(profile: &mut [i32], runs: &[Run]) {
+/// Pixels of each column that belong to silhouettes which are seen whole.
+fn fill(profile: &mut [i32], runs: &[Run], cut: &[bool]) {
     profile.fill(0);
-    for run in runs {
+    let whole = |run: &&Run| cut.get(run.label as usize) == Some(&false);
+    for run in runs.iter().filter(whole) {
         profile[usize::from(run.start)] += 1;
         profile[usize::from(run.end)] -= 1;
     }
@@ -153,12 +177,20 @@ mod tests {
     /// A parcel of 60 x 40 px whose left end is at each of `columns`, 40 frames a second.
     fn ride(columns: impl Iterator<Item = u16>) -> Ride {
         let mut plan = Plan::default();
-        Riders::plan([400, 300], &mut plan);
+        Riders::plan([400, 300], 4, &mut plan);
         let mut memory = plan.reserve(1).expect("small");
         let mut riders = Riders::new(2.0, &mut memory).expect("planned");
+        // The camera sees all but the first and the last column.
+        let row: [u64; words(400)] =
+            std::array::from_fn(|w| if w == 0 { u64::MAX - 1 } else { u64::MAX });
+        let mut seen = row.repeat(300);
+        for row in seen.chunks_exact_mut(row.len()) {
+            row[399 / 64] &= !(1 << (399 % 64));
+        }
         for start in columns {
-            let runs = [0; 40].map(|_| Run { start, end: start + 60, ..Run::default() });
-            riders.step(&runs, 1.0 / 40.0);
+            let end = (start + 60).min(399);
+            let runs = [0; 40].map(|_| Run { start: start.max(1), end, ..Run::default() });
+            riders.step(&runs, &seen, 1.0 / 40.0);
         }
         riders.ride()
     }
@@ -167,6 +199,13 @@ mod tests {
     fn silhouettes_show_their_motion_both_ways() {
         assert_eq!(ride((0..8).map(|k| 10 + 7 * k)), Ride::Moves(560.0));
         assert_eq!(ride((0..8).map(|k| 300 - 7 * k)), Ride::Moves(-560.0));
+    }
+
+    #[test]
+    fn one_that_leaves_the_picture_shows_no_motion() {
+        // Its leading end stays at the border, so that its middle moves at half of its speed.
+        assert_eq!(ride((0..8).map(|k| 338 + 2 * k)), Ride::Unknown);
+        assert_eq!(ride((0..8).map(|k| 1 - k.min(1))), Ride::Unknown);
     }
 
     #[test]
