@@ -83,6 +83,10 @@ enum Command {
         /// Write annotated pictures to this folder.
         #[arg(long)]
         annotate: Option<PathBuf>,
+        /// Write a second opinion to this folder: heights by known motion over the whole pass, as
+        /// records and as a picture.
+        #[arg(long, value_name = "DIR")]
+        explain: Option<PathBuf>,
         /// Spoil the input: drop=SHARE,double=SHARE,late=MS,noise=GREY,seed=N, any of them.
         #[arg(long)]
         inject: Option<String>,
@@ -336,9 +340,13 @@ fn dispatch(command: Command) -> Result<()> {
             let table = demo::run(demo::Options { seconds, out: &out, listen, config })?;
             print(format_args!("{table}\npictures and records are in {}", out.display()))
         }
-        Command::Measure { input, config, fps, jsonl, annotate, inject } => {
+        Command::Measure { input, config, fps, jsonl, annotate, explain, inject } => {
             let site = Site::load(&config)?;
-            let outputs = Outputs { jsonl: jsonl.as_deref(), annotate: annotate.as_deref() };
+            let outputs = Outputs {
+                jsonl: jsonl.as_deref(),
+                annotate: annotate.as_deref(),
+                explain: explain.as_deref(),
+            };
             let camera = config.with_file_name(&site.config.camera.calibration);
             outputs.refuse_inputs(&[&input, &config, &camera])?;
             let faults = inject.as_deref().map(Faults::parse).transpose()?;

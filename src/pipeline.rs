@@ -556,6 +556,11 @@ impl Pipeline {
         self.rectify.view()
     }
 
+    /// The same, rows of [`bits::stride`] pixels.
+    pub fn pixels(&self) -> &[u8] {
+        self.rectify.pixels()
+    }
+
     /// Bit mask of the view's pixels that the camera sees.
     pub fn seen(&self) -> &[u64] {
         self.rectify.seen()

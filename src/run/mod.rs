@@ -6,6 +6,7 @@ mod appliance;
 pub mod budget;
 pub mod calibrate;
 pub mod demo;
+mod explain;
 pub mod import;
 pub mod live;
 pub mod log;

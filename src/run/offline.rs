@@ -1,5 +1,6 @@
 //! `beltgauge measure`: a replay through the pipeline, as fast as it goes.
 
+use super::explain::Explainer;
 use super::outputs::refuse_inputs;
 use super::{Annotator, memory};
 use crate::config::Site;
@@ -19,6 +20,8 @@ pub struct Outputs<'a> {
     pub jsonl: Option<&'a Path>,
     /// Annotated pictures.
     pub annotate: Option<&'a Path>,
+    /// A second opinion: its records and the picture of its evidence.
+    pub explain: Option<&'a Path>,
 }
 
 /// Who watches a replay.
@@ -54,6 +57,7 @@ pub fn measure(
     site.check_image_size([width, height])?;
     let mut annotator = outputs.annotate.map(|f| Annotator::new(f, [width, height])).transpose()?;
     let (mut frames, mut pipeline) = memory::build(site)?;
+    let mut explainer = outputs.explain.map(|f| Explainer::new(f, &pipeline)).transpose()?;
     let mut frame = frames.pop().ok_or_else(|| Error::failure("no frame was planned"))?;
     // Only now: an earlier run's records survive a start that fails.
     let mut lines = outputs.jsonl.map(JsonLines::create).transpose()?;
@@ -69,6 +73,9 @@ pub fn measure(
                 let raw = Plane::packed(&frame, width, height)
                     .ok_or_else(|| Error::failure("a frame of another size"))?;
                 pipeline.step(raw, time, &mut |r| records.push(r))?;
+                if let Some(explainer) = &mut explainer {
+                    explainer.frame(&pipeline, time);
+                }
                 None
             }
             Ok(None) => Some(Ok(pipeline.counters())),
@@ -92,6 +99,9 @@ pub fn measure(
             }
             if let Some(doubt) = belt_doubt(&pipeline) {
                 observer.doubt(&doubt);
+            }
+            if let Some(explainer) = explainer {
+                explainer.finish(&pipeline)?;
             }
             result?;
             annotator.map_or(Ok(()), Annotator::finish)?;

@@ -14,10 +14,12 @@ mod model;
 mod observe;
 mod search;
 mod votes;
+mod whole_pass;
 
-pub use fit::Estimate;
+pub use fit::{Estimate, canonical_estimate};
 pub use model::{HEIGHT, LENGTH, Outline, Params, Rounding, SCALE, WIDTH, X, Y, YAW};
 pub use observe::Frame;
+pub use whole_pass::WholePass;
 
 use crate::belt::BeltPosition;
 use crate::camera::BeltView;
@@ -27,7 +29,7 @@ use crate::kernel::scalar::runs::Run;
 use crate::plan::{Block, Memory, Plan};
 use crate::units::BeltRect;
 use corners::{CORNERS, Corner, top_motion};
-use fit::{Problem, Silhouette, canonical_estimate};
+use fit::{Problem, Silhouette};
 use observe::PassView;
 use search::{Found, Search};
 

@@ -56,6 +56,21 @@ impl Search {
     /// Nothing tried.
     pub const NEW: Self = Self { round: 0, candidates: None, found: [None; 2] };
 
+    /// The best start near a known one: each face's edge as it is or as the votes place it, top or base.
+    pub fn from(problem: &Problem<'_>, views: &[PassView], start: Params) -> Option<Estimate> {
+        let votes = problem.face_votes(views, &start);
+        let mut candidates = Candidates::new(start, votes);
+        let mut best: Option<Estimate> = None;
+        while candidates.left > 0 {
+            let start = candidates.take(problem);
+            let Some(found) = problem.refine_edges(views, start, &GATES_PX) else { continue };
+            if best.is_none_or(|best| found.score() > best.score()) {
+                best = Some(found);
+            }
+        }
+        best
+    }
+
     /// The best start with corners.
     pub fn with_corners(&self) -> Option<Found> {
         self.found[0]

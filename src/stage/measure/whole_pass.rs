@@ -1,0 +1,99 @@
+//! The fit on a pass that lies before one as a whole: no view was spoiled by an early, wrong estimate.
+
+use super::corners::TopMotion;
+use super::fit::{Estimate, GATES_PX, Problem, Silhouette};
+use super::model::{HEIGHT, LENGTH, Outline, Params, Rounding, SCALE, WIDTH, X, Y, YAW};
+use super::observe::{Frame, PassView};
+use super::search::Search;
+use super::{EDGE_COUNT_MIN, Measured, is_box};
+use crate::camera::BeltView;
+use crate::stage::parcels::Face;
+use crate::stage::views::Views;
+use crate::units::BeltRect;
+
+/// A face's height from the evidence is good to this, mm.
+const FACE_HEIGHT_SIGMA_MM: f64 = 1.5;
+/// Times that the profiles are taken anew, where the last fit has the edges.
+const ROUNDS: usize = 3;
+
+/// What does not change from parcel to parcel.
+pub struct WholePass<'a> {
+    /// Belt view geometry.
+    pub geometry: &'a BeltView,
+    /// The measuring zone.
+    pub zone: &'a BeltRect,
+    /// Upper bound of the height.
+    pub height_max_mm: f64,
+    /// What the edges' radius does to them.
+    pub rounding: Rounding,
+    /// Bit mask of the view's pixels that the camera sees.
+    pub seen: &'a [u64],
+}
+
+impl WholePass<'_> {
+    /// Fit a cuboid to the views of a face's pass; X holds at the newest view's belt position.
+    pub fn fit(&self, views: &Views, face: &Face) -> Option<Measured> {
+        let newest = views.kept(views.newest()?).at;
+        let mut params = Params::zeros();
+        params[X] = face.x_less_travel_mm + newest.travel_mm;
+        params[Y] = face.y_mm;
+        params[YAW] = face.yaw;
+        params[LENGTH] = face.length_mm;
+        params[WIDTH] = face.width_mm;
+        params[HEIGHT] = face.height_mm;
+        params[SCALE] = 1.0;
+        let m = self.geometry.magnification(face.height_mm);
+        let sigma = m * m / self.geometry.camera_height_mm * FACE_HEIGHT_SIGMA_MM;
+        let problem = Problem {
+            geometry: self.geometry,
+            zone: self.zone,
+            height_max_mm: self.height_max_mm,
+            rounding: self.rounding,
+            reference_travel_mm: newest.travel_mm,
+            travel_sigma: 3e-4,
+            silhouette: Silhouette::Whole,
+            enclosing: false,
+            top_motion: Some(TopMotion { ratio: m, sigma, highest: m }),
+            view_stride: 1,
+        };
+        let mut best: Option<Estimate> = None;
+        for round in 0..ROUNDS {
+            let pass = self.look(views, &params, newest.travel_mm);
+            let fitted = if round == 0 {
+                Search::from(&problem.on_some_of(&pass), &pass, params)
+                    .and_then(|found| problem.refine_edges(&pass, found.params, &GATES_PX))
+            } else {
+                problem.fit_edges(&pass, params)
+            };
+            let Some(fitted) = fitted else { break };
+            params = fitted.params;
+            best = Some(fitted);
+        }
+        let estimate = best?;
+        let has_edges = estimate.edge_count >= EDGE_COUNT_MIN;
+        Some(Measured { estimate, is_box: is_box(&estimate), has_edges, disputed: false })
+    }
+
+    /// Profiles across a cuboid's edges in every view that has any of it in the zone.
+    fn look(&self, views: &Views, params: &Params, reference_travel_mm: f64) -> Vec<PassView> {
+        let mut pass: Vec<PassView> = Vec::new();
+        for place in views.places() {
+            let travel_mm = views.kept(place).at.travel_mm;
+            let outline = Outline::new(self.geometry, params, travel_mm - reference_travel_mm);
+            let frame = Frame {
+                view: self.geometry,
+                zone: self.zone,
+                grey: views.grey(place),
+                seen: self.seen,
+                dark: &[],
+            };
+            let mut view = PassView::EMPTY;
+            view.travel_mm = travel_mm;
+            frame.sample_edges(&outline, &mut view);
+            if !view.samples().is_empty() {
+                pass.push(view);
+            }
+        }
+        pass
+    }
+}

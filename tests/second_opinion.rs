@@ -1,0 +1,127 @@
+//! Heights by known motion, cell by cell, on a belt of the project's own: what `measure --explain` rests on.
+
+mod common;
+
+use beltgauge::config::{Config, Site};
+use beltgauge::image::Plane;
+use beltgauge::plan::Plan;
+use beltgauge::run;
+use beltgauge::source::FrameSource;
+use beltgauge::source::synthetic::{Scenario, Synthetic};
+use beltgauge::stage::evidence::Evidence;
+use beltgauge::stage::views::Views;
+
+/// Neighbours 12 mm apart, of other heights, and a flat envelope; 1280 x 800, 1.5 m above the belt.
+const SCENARIO: &str = r#"
+seed = 5
+fps = 30
+frames = 170
+exposure_ms = 1.5
+[camera]
+image_size_px = [1280, 800]
+[camera.lens]
+model = "brown"
+fx_px = 680.0
+fy_px = 680.0
+cx_px = 640.0
+cy_px = 400.0
+distortion = [-0.18, 0.08, 0.0, 0.0, -0.008]
+[camera.pose]
+rotation = [[1.0, 0.0, 0.0], [0.0, -1.0, 0.0], [0.0, 0.0, -1.0]]
+translation_mm = [0.0, 0.0, 1500.0]
+[belt]
+speed_mm_per_s = 500.0
+width_mm = 800
+grey = 45
+texture_grey = 1.3
+[[parcel]]
+length_mm = 180.0
+width_mm = 120.0
+height_mm = 130.0
+yaw_deg = 20.0
+x_mm = -1200.0
+y_mm = 120.0
+material = "kraft"
+[[parcel]]
+length_mm = 180.0
+width_mm = 120.0
+height_mm = 60.0
+yaw_deg = 20.0
+x_mm = -1154.85
+y_mm = -4.04
+material = "kraft"
+[[parcel]]
+length_mm = 240.0
+width_mm = 160.0
+height_mm = 5.0
+yaw_deg = -30.0
+x_mm = -1500.0
+y_mm = -180.0
+material = "white"
+"#;
+
+const CONFIG: &str = "[camera]\ncalibration = \"the scenario's\"\n[zone]\nx_min_mm = -600\nx_max_mm = 600\n\
+                      y_min_mm = -380\ny_max_mm = 380\n[belt]\nspeed_mm_per_s = 500\n";
+
+/// Cells of a face agree on its height; what is left are the cells' own 3.5 mm over the zone's parallax.
+const HEIGHT_MM: f64 = 2.0;
+/// More than half of the cells within a top face lie within 6 mm of its height, so that the median
+/// holds; the others are blurred with a side or a neighbour.
+const SHARE_MIN: f64 = 0.5;
+
+#[test]
+fn cells_of_a_top_face_agree_on_its_height() {
+    let scenario = Scenario::parse(SCENARIO).expect("valid");
+    let config = Config::parse(CONFIG).expect("valid");
+    let site = Site::new(config, scenario.camera().expect("valid")).expect("a zone in view");
+    let (view, zone, height_max_mm) = (site.view.clone(), site.config.zone, site.height_max_mm);
+    let (mut frames, mut pipeline) = run::build(site).expect("fits");
+    let mut plan = Plan::default();
+    Views::plan(&view, &mut plan);
+    Evidence::plan(&view, &zone, height_max_mm, &mut plan);
+    let mut memory = plan.reserve(512).expect("fits");
+    let mut views = Views::new(&view, &zone, &mut memory).expect("planned");
+    let mut evidence =
+        Evidence::new(&view, &zone, height_max_mm, pipeline.seen(), &mut memory).expect("planned");
+    memory.seal().expect("all taken");
+
+    let mut source = Synthetic::new(scenario.clone()).expect("a belt");
+    let frame = &mut frames[0];
+    let mut offset_mm = 0.0;
+    while let Some(time) = source.next_into(frame).expect("frames") {
+        let raw = Plane::packed(frame, 1280, 800).expect("its size");
+        pipeline.step(raw, time, &mut |_| ()).expect("measures");
+        let at = pipeline.belt_position();
+        if views.offer(pipeline.pixels(), at, time) {
+            evidence.add(&views, views.newest().expect("just kept"));
+        }
+        evidence.advance(&views, at.travel_mm, at.breaks);
+        offset_mm = scenario.travel_at_frame_mm(time.index) - at.travel_mm;
+    }
+
+    let decided = evidence.decided();
+    for parcel in scenario.parcels() {
+        let mut heights = Vec::new();
+        for column in decided.clone() {
+            let x_mm = evidence.column_mm(column) - offset_mm;
+            for (row, cell) in evidence.column(column).iter().enumerate() {
+                let (dx, dy) = (x_mm - parcel.x_mm, evidence.row_mm(row) - parcel.y_mm);
+                let (sin, cos) = parcel.yaw_deg.to_radians().sin_cos();
+                let (along, across) = (cos * dx + sin * dy, cos * dy - sin * dx);
+                let inside = along.abs() < 0.5 * parcel.length_mm - 4.0
+                    && across.abs() < 0.5 * parcel.width_mm - 4.0;
+                if inside && cell.strength > 0.0 {
+                    heights.push(f64::from(cell.height_mm));
+                }
+            }
+        }
+        heights.sort_by(f64::total_cmp);
+        assert!(heights.len() > 100, "{parcel:?}: {} cells", heights.len());
+        let median_mm = heights[heights.len() / 2];
+        let near = heights.iter().filter(|h| (*h - parcel.height_mm).abs() < 6.0).count();
+        let share = near as f64 / heights.len() as f64;
+        eprintln!("{} mm high: median {median_mm:.1}, {share:.2} near it", parcel.height_mm);
+        assert!((median_mm - parcel.height_mm).abs() < HEIGHT_MM, "{parcel:?}: {median_mm}");
+        assert!(share > SHARE_MIN, "{parcel:?}: {share}");
+    }
+}
