@@ -4,6 +4,7 @@ use super::Pose;
 use super::bundle::{Bundle, Observation, View, board_pose};
 use super::homography::{homography, zhang};
 use super::least_squares::{Normal, minimise};
+use super::turned::{turned_back_rms_px, turned_view};
 use super::verdict;
 use crate::camera::chessboard::{BoardImage, Chessboard, Corner};
 use crate::camera::{LENS_PARAMETERS, Lens, LensModel};
@@ -93,7 +94,52 @@ pub fn calibrate_lens(
     start: LensStart,
     shape: BoardShape,
 ) -> Result<LensCalibration> {
+    let settle = |look| settle(board, image_size_px, images, model, start, shape, look);
+    let mut settled = settle(LookForTurned::Yes)?;
+    // Of another camera, or of no one lens at all, a turned view would not fit the others either.
+    let fits = |&v: &usize| {
+        let error_px = turned_back_rms_px(board, image_size_px, &settled.fitted, &images[v]);
+        error_px.is_some_and(|rms| !verdict::is_bad(&settled.fitted, rms, VIEW_RATIO, VIEW_RMS_PX))
+    };
+    if !settled.turned.iter().all(fits) {
+        settled = settle(LookForTurned::No)?;
+    }
+    let Settled { rejected, kept, fitted, .. } = settled;
+    let mut calibration = summarise(board, images, &rejected, &kept, &fitted)?;
+    verdict::check(board, image_size_px, images, &kept, start, &mut calibration)?;
+    Ok(calibration)
+}
+
+/// Whether views may have been turned by 180 degrees.
+#[derive(Clone, Copy, PartialEq, Eq)]
+enum LookForTurned {
+    Yes,
+    No,
+}
+
+/// A fit of what belongs together.
+struct Settled {
+    fitted: Fitted,
+    /// Numbers of the views fitted.
+    kept: Vec<usize>,
+    /// Why others are not.
+    rejected: Vec<Option<String>>,
+    /// Those that seem to be turned.
+    turned: Vec<usize>,
+}
+
+/// Fit, reject the view that belongs least, and again, until all belong.
+fn settle(
+    board: &Chessboard,
+    image_size_px: [usize; 2],
+    images: &[BoardImage],
+    model: LensModel,
+    start: LensStart,
+    shape: BoardShape,
+    look: LookForTurned,
+) -> Result<Settled> {
     let mut rejected = verdict::unusable(images, SMEAR_PX_MAX, VIEWS_MIN);
+    let mut turned = Vec::new();
     let mut found: Option<(Lens, Vec<Pose>)> = None;
     loop {
         let kept: Vec<usize> = (0..images.len()).filter(|&v| rejected[v].is_none()).collect();
@@ -106,17 +152,24 @@ pub fn calibrate_lens(
             None => initial(board, image_size_px, &views, model, start)?,
         };
         let mut fitted = fit(board, views, first, shape)?;
-        if let Some(worst) = verdict::worst_view(&fitted, VIEW_RATIO, VIEW_RMS_PX)
-            && kept.len() > VIEWS_MIN
-        {
-            rejected[kept[worst]] = Some(verdict::does_not_belong(&fitted, worst));
-            fitted.poses.remove(worst);
-            found = Some((fitted.lens, fitted.poses));
-            continue;
+        // A turned picture may be the worst, or hide among the others: it has its own reason.
+        let back = (look == LookForTurned::Yes)
+            .then(|| turned_view(board, image_size_px, &fitted))
+            .flatten()
+            .filter(|back| !verdict::is_bad(&fitted, back.rms_px[1], VIEW_RATIO, VIEW_RMS_PX));
+        let is_turned = back.is_some();
+        let worst = back
+            .map(|back| (back.view, verdict::is_turned(&back)))
+            .or_else(|| verdict::worst_view(&fitted, VIEW_RATIO, VIEW_RMS_PX));
+        match worst.filter(|_| kept.len() > VIEWS_MIN) {
+            None => return Ok(Settled { fitted, kept, rejected, turned }),
+            Some((worst, reason)) => {
+                turned.extend(is_turned.then_some(kept[worst]));
+                rejected[kept[worst]] = Some(reason);
+                fitted.poses.remove(worst);
+                found = Some((fitted.lens, fitted.poses));
+            }
         }
-        let mut calibration = summarise(board, images, &rejected, &kept, &fitted)?;
-        verdict::check(board, image_size_px, images, &kept, start, &mut calibration)?;
-        return Ok(calibration);
     }
 }
 
