@@ -184,6 +184,20 @@ fn a_belt_that_runs_backwards_is_said_and_its_parcels_are_told() {
 }
 
 #[test]
+fn what_rides_backwards_and_never_gets_a_shape_is_told() {
+    let mut scenario = belt(&[(SIZE_MM, 0.0); 2], 90.0, 2.0, "");
+    scenario.frames += 60;
+    let mut site = site(&scenario, 500.0);
+    // To the ends of the picture: nothing is seen beyond the exit.
+    (site.config.zone.x_min_mm, site.config.zone.x_max_mm) = (-562.0, 562.0);
+    let site = Site::new(site.config, site.camera).expect("a zone in view");
+    let (records, _) = run(&scenario, site, |_, frame, _| {
+        frame.chunks_exact_mut(640).for_each(<[u8]>::reverse);
+    });
+    assert!(records.len() == 2 && records.iter().all(|r| !r.may_be_used), "{records:#?}");
+}
+
+#[test]
 fn over_a_gap_that_the_view_cannot_bridge_nothing_is_lost_silently() {
     let scenario = boxes(3, 60.0, 2.0, "");
     // The first box is in the middle, the second about to come, the third far.
