@@ -9,46 +9,83 @@ use super::bundle::board_pose;
 use super::least_squares::{Numeric, minimise};
 use super::lens::Fitted;
 use super::reprojection_error;
+use crate::camera::Lens;
 use crate::camera::chessboard::{BoardImage, Chessboard, Corner};
 use crate::units::RawPx;
 use nalgebra::{DVector, Vector2};
 
-/// A gain of so many variances is no chance: five standard deviations.
-const GAIN_VARIANCES: f64 = 25.0;
+/// A difference of so many variances is no chance: five standard deviations.
+const DECIDED_VARIANCES: f64 = 25.0;
+/// Fits in which views change sides until none does; seen: two to four.
+const ROUNDS_MAX: usize = 8;
 /// A pose converges in far fewer.
 const STEPS_MAX: usize = 30;
 
-/// A view that fits the lens turned back only.
+/// A view that is turned against most of the others.
 pub(super) struct TurnedView {
     /// Its number among those fitted.
     pub(super) view: usize,
-    /// Root mean square error as it is, and turned back, px.
+    /// Root mean square error as the others are, and turned back, px.
     pub(super) rms_px: [f64; 2],
 }
 
-/// The view that gains most from being turned back, when that is no chance.
-pub(super) fn turned_view(
+/// The views that are turned against most of the others; of two halves those unlike the first.
+///
+/// A fit of pictures of both kinds lies between them, so that none of them stands out: the views are turned
+/// as they fit better, and fitted anew by `refit` from a lens, until all are of one kind.
+pub(super) fn turned_views(
     board: &Chessboard,
     image_size_px: [usize; 2],
-    fitted: &Fitted,
-) -> Option<TurnedView> {
+    images: &[BoardImage],
+    first: &Fitted,
+    refit: &dyn Fn(&[BoardImage], &Lens) -> Option<Fitted>,
+) -> Option<(Vec<TurnedView>, Vec<f64>)> {
+    let turn = |image: &BoardImage| BoardImage {
+        corners: turned_back(board, image_size_px, &image.corners),
+        ..image.clone()
+    };
+    let backs: Vec<BoardImage> = images.iter().map(turn).collect();
+    let mut refitted: Option<Fitted> = None;
+    let mut is_back = vec![false; images.len()];
+    for _ in 0..ROUNDS_MAX {
+        let fitted = refitted.as_ref().unwrap_or(first);
+        let fits_back = |v: usize| {
+            let [as_it_is, back] =
+                [images, &backs].map(|i| squares(board, fitted, &inliers(fitted, v, &i[v])));
+            Some(back? < as_it_is?)
+        };
+        let next: Vec<bool> = (0..images.len()).map(fits_back).collect::<Option<_>>()?;
+        if next == is_back {
+            break;
+        }
+        is_back = next;
+        let chosen = |v: usize| if is_back[v] { &backs[v] } else { &images[v] }.clone();
+        let chosen: Vec<BoardImage> = (0..images.len()).map(chosen).collect();
+        refitted = Some(refit(&chosen, &fitted.lens)?);
+    }
+    let fitted = refitted?;
     // Of one coordinate of a corner.
     let variance = 0.5 * fitted.rms_px * fitted.rms_px;
-    let gain = |view: usize| {
-        let corners: Vec<Corner> = fitted.views[view]
-            .observations
-            .iter()
-            .filter(|o| !o.is_outlier)
-            .map(|o| o.corner)
-            .collect();
-        let as_it_is = squares(board, fitted, &corners)?;
-        let turned = squares(board, fitted, &turned_back(board, image_size_px, &corners))?;
-        let rms_px = [as_it_is, turned].map(|sum| (sum / corners.len() as f64).sqrt());
-        Some((as_it_is - turned, TurnedView { view, rms_px }))
+    // Sums of squares the other way, and the way it fits; where that is no chance.
+    let decided = |v: usize| {
+        let [as_it_is, back] =
+            [images, &backs].map(|i| squares(board, &fitted, &inliers(&fitted, v, &i[v])));
+        let sums = if is_back[v] { [as_it_is?, back?] } else { [back?, as_it_is?] };
+        let count = inliers(&fitted, v, &images[v]).len() as f64;
+        let rms_px = sums.map(|sum| (sum / count).sqrt());
+        let turned = TurnedView { view: v, rms_px };
+        (sums[0] - sums[1] > DECIDED_VARIANCES * variance).then_some((is_back[v], turned))
     };
-    let (gain, turned) =
-        (0..fitted.views.len()).filter_map(gain).max_by(|a, b| a.0.total_cmp(&b.0))?;
-    (gain > GAIN_VARIANCES * variance).then_some(turned)
+    let (one, other): (Vec<_>, Vec<_>) =
+        (0..images.len()).filter_map(decided).partition(|(back, _)| *back == is_back[0]);
+    let fewer = if one.len() < other.len() { one } else { other };
+    Some((fewer.into_iter().map(|(_, turned)| turned).collect(), fitted.view_rms_px))
+}
+
+/// The corners of a view that the fit did not leave out: one far off would outweigh the rest.
+fn inliers(fitted: &Fitted, view: usize, image: &BoardImage) -> Vec<Corner> {
+    let seen = fitted.views[view].observations.iter().zip(&image.corners);
+    seen.filter(|(o, _)| !o.is_outlier).map(|(_, &corner)| corner).collect()
 }
 
 /// Error of an image turned back, px, whether it was fitted or not.

@@ -81,20 +81,30 @@ pub(super) fn unusable(
 pub(super) fn worst_view(fitted: &Fitted, ratio: f64, rms_px_min: f64) -> Option<(usize, String)> {
     let rms = &fitted.view_rms_px;
     let worst = (0..rms.len()).max_by(|&a, &b| rms[a].total_cmp(&rms[b]))?;
-    is_bad(fitted, rms[worst], ratio, rms_px_min).then(|| (worst, does_not_belong(fitted, worst)))
+    is_bad(rms, rms[worst], ratio, rms_px_min).then(|| (worst, does_not_belong(fitted, worst)))
 }
 
 /// Whether a view of such an error does not belong to the others.
-pub(super) fn is_bad(fitted: &Fitted, rms_px: f64, ratio: f64, rms_px_min: f64) -> bool {
-    rms_px > (ratio * median(fitted.view_rms_px.clone())).max(rms_px_min)
+pub(super) fn is_bad(all_px: &[f64], rms_px: f64, ratio: f64, rms_px_min: f64) -> bool {
+    rms_px > (ratio * median(all_px.to_vec())).max(rms_px_min)
 }
 
 pub(super) fn is_turned(turned: &TurnedView) -> String {
     let [as_it_is, turned_back] = turned.rms_px;
     format!(
-        "turned by 180 degrees: error of {as_it_is:.2} px as it is, of {turned_back:.2} px turned back: use \
+        "turned by 180 degrees against the others: error of {as_it_is:.2} px as it is, of {turned_back:.2} px turned back: use \
          images as the camera delivers them, all of one mounting"
     )
+}
+
+/// Where both kinds are about as telling, those kept may be the wrong ones.
+pub(super) fn turned_warning(count: usize) -> Option<String> {
+    (count > 0).then(|| {
+        format!(
+            "{count} images seem to be turned by 180 degrees against the others, or the others against them: \
+             the principal point may be wrong. Use images as the camera delivers them, all of one mounting"
+        )
+    })
 }
 
 fn does_not_belong(fitted: &Fitted, view: usize) -> String {

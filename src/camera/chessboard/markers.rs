@@ -22,7 +22,7 @@ pub(super) fn fill(image: &Grey, grid: &Grid, halvings: usize) -> bool {
     let shift = Vector2::repeat(0.5 * (scale - 1.0));
     let at = |cell: Cell| grid.get(&cell).map(|at| scale * at + shift);
     let spans_of = |colour: f64| -> [Vec<f64>; 2] {
-        let squares = grid.keys().filter(|&&cell| parity_sign(cell) == colour);
+        let squares = grid.keys().filter(|&&cell| colour * parity_sign(cell) > 0.0);
         squares
             .filter_map(|&(x, y)| {
                 let corners = [at((x, y))?, at((x + 1, y))?, at((x, y + 1))?, at((x + 1, y + 1))?];
