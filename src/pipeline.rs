@@ -412,14 +412,12 @@ impl Pipeline {
     /// Whether the middle of a track's image, as large as the smallest parcel, has been in the zone.
     fn rode(&self, slot: usize) -> bool {
         let track = &self.tracker.tracks()[slot];
-        let b = &track.bounds;
-        let sides_px = [b.u1 - b.u0, b.v1 - b.v0];
+        let sides_px = [track.bounds.u1 - track.bounds.u0, track.bounds.v1 - track.bounds.v0];
         let here_mm = self.image_on_belt(slot).x;
         let first_mm = here_mm - (self.at.travel_mm - track.first.travel_mm);
-        let (from_mm, to_mm) = (here_mm.min(first_mm), here_mm.max(first_mm));
         self.counts(sides_px.map(|px| f64::from(px) * self.site.view.mm_per_px))
-            && from_mm <= self.zone.x_max_mm
-            && to_mm >= self.zone.x_min_mm
+            && here_mm.min(first_mm) <= self.zone.x_max_mm
+            && here_mm.max(first_mm) >= self.zone.x_min_mm
     }
 
     /// Where the middle of a track's image lies on the belt.
