@@ -378,12 +378,9 @@ impl Pipeline {
         let had_shape = self.measure.outline(slot, self.at).is_some();
         let measured = self.measure.finish(slot, reference.at);
         // A sliver of shadow or light is smaller than the smallest blob that counts.
-        let segment = &self.site.config.segment;
-        let side_min_mm = segment.side_min_mm.unwrap_or(SIDE_MIN_PX * self.site.view.mm_per_px);
         let is_sliver = |m: &Measured| {
             let p = &m.estimate.params;
-            p[measure::LENGTH] * p[measure::WIDTH] < segment.area_min_mm2
-                || p[measure::WIDTH] < side_min_mm
+            !self.counts([p[measure::LENGTH], p[measure::WIDTH]])
         };
         if measured.as_ref().is_some_and(is_sliver) {
             self.counters.slivers += 1;
@@ -391,8 +388,9 @@ impl Pipeline {
         }
         // A pass that was cut short counts only if edges were found.
         let measured = measured.filter(|m| m.has_edges || flags == Flags::default());
-        // What vanished before it had a shape was a hand, or a piece that joined its parcel.
-        if measured.is_none() && flags.has(Flags::LOST) && !had_shape {
+        // What vanished before it had a shape was a hand, or a piece that joined its parcel, unless it
+        // has ridden through the zone and is as large as a parcel: a sorter must know of it.
+        if measured.is_none() && flags.has(Flags::LOST) && !had_shape && !self.rode(slot) {
             return;
         }
         self.counters.parcels += 1;
@@ -402,6 +400,24 @@ impl Pipeline {
             None => self.record_without_size(slot, flags),
         };
         emit(record.rounded());
+    }
+
+    /// Whether something of these sides is as large as the smallest parcel.
+    fn counts(&self, [length_mm, width_mm]: [f64; 2]) -> bool {
+        let segment = &self.site.config.segment;
+        let side_min_mm = segment.side_min_mm.unwrap_or(SIDE_MIN_PX * self.site.view.mm_per_px);
+        length_mm * width_mm >= segment.area_min_mm2 && length_mm.min(width_mm) >= side_min_mm
+    }
+
+    /// Whether the middle of a track's image, as large as the smallest parcel, has been in the zone.
+    fn rode(&self, slot: usize) -> bool {
+        let track = &self.tracker.tracks()[slot];
+        let sides_px = [track.bounds.u1 - track.bounds.u0, track.bounds.v1 - track.bounds.v0];
+        let here_mm = self.image_on_belt(slot).x;
+        let first_mm = here_mm - (self.at.travel_mm - track.first.travel_mm);
+        self.counts(sides_px.map(|px| f64::from(px) * self.site.view.mm_per_px))
+            && here_mm.min(first_mm) <= self.zone.x_max_mm
+            && here_mm.max(first_mm) >= self.zone.x_min_mm
     }
 
     /// Where the middle of a track's image lies on the belt.
@@ -531,6 +547,11 @@ impl Pipeline {
     pub fn health(&self) -> Health {
         let contrast_min_grey = self.background.contrast_min_grey();
         self.witnesses.health(&self.odometry, self.riders.ride(), contrast_min_grey)
+    }
+
+    /// Frames that the belt's steps show to be missing, though their times do not tell.
+    pub fn untold_gaps(&self) -> u64 {
+        self.odometry.untold_gaps()
     }
 
     /// Whether the empty belt has been learned.

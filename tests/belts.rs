@@ -171,7 +171,9 @@ fn a_speed_far_from_the_nominal_one_is_found_and_said() {
 
 #[test]
 fn a_belt_that_runs_backwards_is_said_and_its_parcels_are_told() {
-    let scenario = boxes(2, 60.0, 2.0, "");
+    let mut scenario = boxes(2, 60.0, 2.0, "");
+    // Until the last has left the picture.
+    scenario.frames += 60;
     let (records, pipeline) = run(&scenario, site(&scenario, 500.0), |_, frame, _| {
         frame.chunks_exact_mut(640).for_each(<[u8]>::reverse);
     });
@@ -179,6 +181,20 @@ fn a_belt_that_runs_backwards_is_said_and_its_parcels_are_told() {
     let health = pipeline.health();
     assert!(health.belt_seen_mm_per_s.is_some_and(|seen| seen < -450.0), "{health:?}");
     assert!(health.belt_not_as_configured);
+}
+
+#[test]
+fn what_rides_backwards_and_never_gets_a_shape_is_told() {
+    let mut scenario = belt(&[(SIZE_MM, 0.0); 2], 90.0, 2.0, "");
+    scenario.frames += 60;
+    let mut site = site(&scenario, 500.0);
+    // To the ends of the picture: nothing is seen beyond the exit.
+    (site.config.zone.x_min_mm, site.config.zone.x_max_mm) = (-562.0, 562.0);
+    let site = Site::new(site.config, site.camera).expect("a zone in view");
+    let (records, _) = run(&scenario, site, |_, frame, _| {
+        frame.chunks_exact_mut(640).for_each(<[u8]>::reverse);
+    });
+    assert!(records.len() == 2 && records.iter().all(|r| !r.may_be_used), "{records:#?}");
 }
 
 #[test]
@@ -217,6 +233,33 @@ fn an_encoder_that_shows_another_travel_than_the_belt_is_found_out() {
         let health = pipeline.health();
         let (found, sigma) = health.encoder_ratio.expect("compared");
         assert!(health.encoder_disagrees && (found - ratio).abs() < 0.002, "{found} +- {sigma}");
+    }
+}
+
+#[test]
+fn frames_missing_without_a_word_are_bridged_and_told() {
+    let scenario = boxes(2, 60.0, 2.0, "");
+    for every in [8, 30] {
+        let mut source = Synthetic::new(scenario.clone()).expect("renders");
+        let (mut frames, mut pipeline) =
+            beltgauge::run::build(site(&scenario, 500.0)).expect("fits");
+        let mut frame = frames.pop().expect("planned");
+        let (mut records, mut index) = (Vec::new(), 0);
+        while let Some(time) = source.next_into(&mut frame).expect("renders") {
+            if time.index > 20 && time.index % every == 0 {
+                continue;
+            }
+            // As a file that has no times of its own.
+            let time = FrameTime { index, t_s: index as f64 / 30.0 };
+            index += 1;
+            let raw = Plane::packed(&frame, 640, 400).expect("this size");
+            pipeline.step(raw, time, &mut |r| records.push(r)).expect("this size");
+        }
+        assert!(
+            records.len() == 2 && records.iter().all(|r| is_right(r) && r.may_be_used),
+            "{records:#?}"
+        );
+        assert_eq!(pipeline.untold_gaps(), scenario.frames - index, "every {every}");
     }
 }
 

@@ -67,6 +67,27 @@ fn opencv_s_boards_are_all_found_and_fit() {
 }
 
 #[test]
+fn a_third_of_a_real_camera_s_stills_turned_by_180_degrees_is_told() {
+    let Some(data) = shared_data("data/opencv_chessboard") else { return };
+    let folder = scratch("turned_stills");
+    for (k, path) in images(&data, "left").iter().enumerate() {
+        let picture = image::open(path).expect("a picture").into_luma8();
+        let (name, picture) = if k % 3 == 1 {
+            (format!("{k:02}_turned.png"), image::imageops::rotate180(&picture))
+        } else {
+            (format!("{k:02}.png"), picture)
+        };
+        picture.save(folder.join(name)).expect("writable");
+    }
+    let files = images(&folder, "");
+    let file = calibrate("turned", "lens", &files, &["--board", "9x6", "--square-mm", "25"]);
+    // Which of both kinds is turned is not always found, that there are two is.
+    let warnings = file["warnings"].as_array().expect("warnings");
+    let told = |w: &toml::Value| w.as_str().is_some_and(|w| w.contains("turned by 180 degrees"));
+    assert!(warnings.iter().any(told) && !rejected(&file).is_empty(), "{warnings:?}");
+}
+
+#[test]
 fn a_rendered_lens_to_a_twentieth_of_a_per_cent() {
     let Some(data) = shared_data("data/rendered/calib_lens") else { return };
     let truth = truth(&data.join("truth.json"));

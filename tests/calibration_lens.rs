@@ -311,3 +311,43 @@ fn a_board_behind_the_camera_has_no_picture() {
     let behind = pose(&board(), [10.0, 0.0, 0.0], [0.0, 0.0, -400.0]);
     assert!(scene::corners(&board(), &brown(), &behind).is_none());
 }
+
+/// As a program that turns pictures by 180 degrees leaves it: the finder names its corners alike.
+fn turn(image: &mut BoardImage) {
+    for corner in &mut image.corners {
+        corner.at.x = SIZE[0] as f64 - 1.0 - corner.at.x;
+        corner.at.y = SIZE[1] as f64 - 1.0 - corner.at.y;
+    }
+}
+
+#[test]
+fn stills_turned_by_180_degrees_are_rejected_with_that_reason() {
+    for turned in [1, 4, 7] {
+        let mut random = Random(18);
+        let mut images = views(&brown(), &poses(16, &mut random), &mut random);
+        images.iter_mut().step_by(2).take(turned).for_each(turn);
+        let found = calibrate(&images, LensModel::Brown).expect("enough good views");
+        assert_recovers(&brown(), &found);
+        for (k, view) in found.views.iter().enumerate() {
+            let is_turned = k % 2 == 0 && k < 2 * turned;
+            let reason = view.rejected.as_deref();
+            assert_eq!(reason.is_some(), is_turned, "{turned}, view {k}: {reason:?}");
+            assert!(reason.is_none_or(|r| r.contains("turned by 180")), "{reason:?}");
+        }
+    }
+}
+
+#[test]
+fn an_error_that_is_wild_for_the_resolution_is_warned_about() {
+    let mut random = Random(19);
+    let poses = poses(12, &mut random);
+    // The same error is nothing unusual in an image of three times the size.
+    for (scale, wild) in [(1.0, true), (1.0 / 3.0, false)] {
+        let images: Vec<BoardImage> =
+            poses.iter().map(|p| seen(&board(), &brown(), p, scale * 1.0, &mut random)).collect();
+        let found = calibrate(&images, LensModel::Brown).expect("a result");
+        let warned =
+            found.warnings.iter().any(|w| w.contains("too much for images of 1920 x 1200"));
+        assert_eq!(warned, wild, "rms {}: {:?}", found.rms_px, found.warnings);
+    }
+}

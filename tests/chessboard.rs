@@ -137,6 +137,41 @@ fn a_small_far_board() {
 }
 
 #[test]
+fn squares_of_five_px() {
+    let (board, lens) = (board(), pinhole(VGA));
+    for angles in [[0.0; 3], [0.0, 0.0, 20.0], [5.0, 5.0, -30.0]] {
+        let error = error_px(&board, &lens, angles, [40.0, 30.0, 2880.0], Shot::sharp(VGA));
+        assert!(error < 6.0 * SHARP_PX, "{angles:?}: {error:.4} px"); // 22 pixels a corner
+    }
+}
+
+#[test]
+fn a_board_with_markers_in_its_squares_is_named() {
+    let (board, lens) = (board(), pinhole(VGA));
+    let straight = pose(&board, [0.0; 3], [0.0, 0.0, 400.0]);
+    let mut still = photograph(&board, &lens, &straight, Shot::sharp(VGA));
+    let first = corners(&board, &lens, &straight).expect("in front")[0].at;
+    let square_px = 0.9 * VGA[0] as f64 * board.square_mm / 400.0;
+    let mut random = Random(6);
+    let bits: [bool; 36 * 70] = std::array::from_fn(|_| random.unit() < 0.5);
+    for (k, grey) in still.pixels.iter_mut().enumerate() {
+        let at = [(k % VGA[0]) as f64 - first.x, (k / VGA[0]) as f64 - first.y];
+        let [i, j] = at.map(|px| (px / square_px).floor() as isize);
+        // Six by six cells in the middle seven tenths, the outermost black.
+        let cell = at.map(|px| ((px / square_px).rem_euclid(1.0) - 0.15) / 0.7 * 6.0);
+        let on_board = (-1..9).contains(&i) && (-1..6).contains(&j);
+        if on_board && (i + j).rem_euclid(2) == 1 && cell.iter().all(|c| (0.0..6.0).contains(c)) {
+            let [u, v] = cell.map(|c| c as usize);
+            let inside = (1..5).contains(&u) && (1..5).contains(&v);
+            let number = (j + 1) as usize * 10 + (i + 1) as usize;
+            *grey = if inside && bits[36 * number + 6 * v + u] { 200 } else { 30 };
+        }
+    }
+    assert_eq!(find(&board, &still), Err(NotFound::Markers));
+    assert_eq!(find(&Chessboard::new([8, 5], 25.0), &still), Err(NotFound::Markers));
+}
+
+#[test]
 fn five_megapixels() {
     let size = [2592, 1944];
     let error =
@@ -146,7 +181,9 @@ fn five_megapixels() {
 
 #[test]
 fn rows_by_columns_is_the_same_board() {
-    assert_eq!(Chessboard::new([6, 9], 25.0), Chessboard::new([9, 6], 25.0));
+    let (named, other) = (Chessboard::new([6, 9], 25.0), Chessboard::new([9, 6], 25.0));
+    assert_eq!((named.columns, named.rows), (other.columns, other.rows));
+    assert_eq!((named.in_order([9, 6]), other.in_order([9, 6])), ("6x9".into(), "9x6".into()));
 }
 
 #[test]

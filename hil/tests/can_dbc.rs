@@ -97,3 +97,32 @@ fn cantools_reads_the_status_and_names_what_a_plc_may_send() {
         is(&signals, name, expected);
     }
 }
+
+#[test]
+fn cantools_finds_comments_cycle_times_and_the_kind_of_bus() {
+    let output = Command::new(project().join("target/hil-venv/bin/python"))
+        .arg(project().join("hil/clients/describe_dbc.py"))
+        .arg(project().join("config/beltgauge.dbc"))
+        .output()
+        .expect(".ci/run makes the environment, with cantools");
+    assert!(output.status.success(), "{}", String::from_utf8_lossy(&output.stderr));
+    let told: Value = serde_json::from_slice(&output.stdout).expect("JSON");
+    assert_eq!(told["bus"], "CAN FD");
+    assert_eq!(told["nodes"]["Beltgauge"], "the measuring appliance");
+    let messages = told["messages"].as_object().expect("messages");
+    for (name, message) in messages {
+        assert!(message["comment"].is_string(), "{name}");
+        let period_ms = match name.as_str() {
+            "Heartbeat" => 100,
+            "Status" => 1000,
+            _ => 0,
+        };
+        assert_eq!(message["cycle_time_ms"].as_u64().unwrap_or(0), period_ms, "{name}");
+        assert_eq!(message["is_fd"], name == "ParcelFd", "{name}");
+    }
+    let parcel = &messages["Parcel"]["signals"];
+    assert!(parcel["length"].is_string() && parcel["flags"].is_string(), "{parcel}");
+    // The two bytes that head a segment have no row of their own in the table.
+    let bare = parcel.as_object().expect("signals").values().filter(|c| c.is_null()).count();
+    assert_eq!(bare, 2, "{parcel}");
+}

@@ -87,20 +87,71 @@ pub fn document(base_id: u16) -> String {
                 .write(&mut text);
         }
     }
-    text.push('\n');
-    let fd = base_id + Message::ParcelFd as u16;
-    let _ = write!(
-        text,
-        "BA_DEF_ BO_ \"VFrameFormat\" ENUM \"StandardCAN\",\"ExtendedCAN\",\"reserved\",\"J1939PG\",\
-         \"reserved\",\"reserved\",\"reserved\",\"reserved\",\"reserved\",\"reserved\",\"reserved\",\
-         \"reserved\",\"reserved\",\"reserved\",\"StandardCAN_FD\",\"ExtendedCAN_FD\";\n\
-         BA_DEF_DEF_ \"VFrameFormat\" \"StandardCAN\";\nBA_ \"VFrameFormat\" BO_ {fd} 14;\n"
-    );
+    comments(&mut text, base_id);
+    attributes(&mut text, base_id);
     let heartbeat = base_id + Message::Heartbeat as u16;
     values(&mut text, heartbeat, "reason", REASONS.iter().map(|(code, meaning)| (*code, *meaning)));
     let command = base_id + Message::Command as u16;
     values(&mut text, command, "command", COMMANDS.iter().map(|(code, meaning)| (*code, *meaning)));
     text
+}
+
+/// What nodes, messages and signals mean.
+fn comments(text: &mut String, base_id: u16) {
+    let _ =
+        writeln!(text, "\nCM_ \"Parcels measured on a conveyor, and what their sorter may ask.\";");
+    let _ = writeln!(text, "CM_ BU_ Beltgauge \"the measuring appliance\";");
+    let _ = writeln!(text, "CM_ BU_ PLC \"the sorter's controller\";");
+    for message in Message::ALL {
+        let (id, meaning) = (base_id + message as u16, message.meaning());
+        let _ = writeln!(text, "CM_ BO_ {id} \"{meaning}\";");
+    }
+    comment(text, base_id, Message::Heartbeat, frames::heartbeat_places());
+    comment(text, base_id, Message::Status, frames::status_places());
+    comment(text, base_id, Message::Parcel, frames::parcel_places());
+    comment(text, base_id, Message::ParcelFd, frames::parcel_fd_places());
+    comment(text, base_id, Message::Result, frames::result_places());
+}
+
+fn comment<S: 'static>(
+    text: &mut String,
+    base_id: u16,
+    message: Message,
+    places: impl Iterator<Item = Place<'static, S>>,
+) {
+    for Place { field, .. } in places {
+        let (id, meaning) = (base_id + message as u16, plain(field.meaning));
+        let _ = writeln!(text, "CM_ SG_ {id} {} \"{meaning}\";", field.name);
+    }
+}
+
+/// The attributes that database tools look for: kind of bus, kind of frame, cycle time.
+fn attributes(text: &mut String, base_id: u16) {
+    let fd = base_id + Message::ParcelFd as u16;
+    let _ = write!(
+        text,
+        "\nBA_DEF_ \"BusType\" STRING ;\n\
+         BA_DEF_ BO_ \"GenMsgCycleTime\" INT 0 65535;\n\
+         BA_DEF_ BO_ \"VFrameFormat\" ENUM \"StandardCAN\",\"ExtendedCAN\",\"reserved\",\"J1939PG\",\
+         \"reserved\",\"reserved\",\"reserved\",\"reserved\",\"reserved\",\"reserved\",\"reserved\",\
+         \"reserved\",\"reserved\",\"reserved\",\"StandardCAN_FD\",\"ExtendedCAN_FD\";\n\
+         BA_DEF_DEF_ \"BusType\" \"CAN\";\n\
+         BA_DEF_DEF_ \"GenMsgCycleTime\" 0;\n\
+         BA_DEF_DEF_ \"VFrameFormat\" \"StandardCAN\";\n\
+         BA_ \"BusType\" \"CAN FD\";\n"
+    );
+    for message in Message::ALL {
+        if let Some(period) = message.period() {
+            let (id, ms) = (base_id + message as u16, period.as_millis());
+            let _ = writeln!(text, "BA_ \"GenMsgCycleTime\" BO_ {id} {ms};");
+        }
+    }
+    let _ = writeln!(text, "BA_ \"VFrameFormat\" BO_ {fd} 14;");
+}
+
+/// A text without what has a meaning of its own in the printed documents or in this one.
+fn plain(meaning: &str) -> String {
+    meaning.replace('`', "").replace('"', "'")
 }
 
 fn values<'a>(
@@ -111,7 +162,7 @@ fn values<'a>(
 ) {
     let _ = write!(text, "VAL_ {id} {signal}");
     for (code, meaning) in values {
-        let _ = write!(text, " {code} \"{}\"", meaning.replace('`', ""));
+        let _ = write!(text, " {code} \"{}\"", plain(meaning));
     }
     text.push_str(" ;\n");
 }

@@ -11,6 +11,7 @@ use super::table::Field;
 pub use super::table::Type;
 use crate::event::ParcelRecord;
 use heapless::Vec;
+use std::time::Duration;
 
 /// Bytes of a classical frame.
 const CLASSICAL_BYTES: usize = 8;
@@ -38,6 +39,52 @@ pub enum Message {
     Encoder = 9,
     /// From the PLC: its heartbeat.
     PlcHeartbeat = 10,
+}
+
+/// Between two heartbeats.
+pub const HEARTBEAT_PERIOD: Duration = Duration::from_millis(100);
+/// Between two tellings of the status, all its segments in turn.
+pub const STATUS_PERIOD: Duration = Duration::from_secs(1);
+
+impl Message {
+    /// All of them, by number.
+    pub const ALL: [Self; 8] = [
+        Self::Heartbeat,
+        Self::Status,
+        Self::Parcel,
+        Self::ParcelFd,
+        Self::Result,
+        Self::Command,
+        Self::Encoder,
+        Self::PlcHeartbeat,
+    ];
+
+    /// What it tells, for documents.
+    pub const fn meaning(self) -> &'static str {
+        match self {
+            Self::Heartbeat => "heartbeat, status, fault and reason, ten times a second",
+            Self::Status => "the rest of the status block in segments, once a second",
+            Self::Parcel => {
+                "a parcel in segments with the same first byte, when it has left the zone: whole when all have come"
+            }
+            Self::ParcelFd => "a parcel in one CAN FD frame, instead of the segments",
+            Self::Result => "what became of a command, when it is carried out or refused",
+            Self::Command => {
+                "from the PLC: ticket, command, argument; a ticket is carried out once"
+            }
+            Self::Encoder => "from the PLC: count of the encoder, as often as it can",
+            Self::PlcHeartbeat => "from the PLC: any number that changes, to show that it is alive",
+        }
+    }
+
+    /// How often it comes by itself; `None`: when there is something to tell.
+    pub const fn period(self) -> Option<Duration> {
+        match self {
+            Self::Heartbeat => Some(HEARTBEAT_PERIOD),
+            Self::Status => Some(STATUS_PERIOD),
+            _ => None,
+        }
+    }
 }
 
 /// Bytes of a frame.

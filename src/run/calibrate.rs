@@ -31,7 +31,16 @@ pub struct DataSheet {
 pub(super) struct Shot {
     pub(super) name: String,
     pub(super) still: Still,
-    pub(super) board: std::result::Result<BoardImage, NotFound>,
+    pub(super) board: std::result::Result<BoardImage, NoUse>,
+}
+
+/// Why a still is of no use.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(super) enum NoUse {
+    /// No board was found in it.
+    NoBoard(NotFound),
+    /// Its size is not this one, that of most.
+    NotOfSize([usize; 2]),
 }
 
 /// Calibrate a lens. `say` gets a line of progress an image, then the result.
@@ -45,8 +54,9 @@ pub fn lens(
 ) -> Result<Vec<String>> {
     let files = files_of(images)?;
     let page = report_beside(out, &[&files])?;
-    let shots = look(&files, None, board, say)?;
-    let size_px = shots[0].still.size_px;
+    let stills = load(&files)?;
+    let size_px = size_of_most(&files, &stills)?;
+    let shots = look(&files, stills, size_px, board, say)?;
     let found: Vec<BoardImage> = shots.iter().filter_map(|s| s.board.clone().ok()).collect();
     let start = data_sheet.map_or(LensStart::Unknown, |sheet| {
         LensStart::FocalPx(sheet.focal_mm / sheet.sensor_width_mm * size_px[0] as f64)
@@ -65,7 +75,7 @@ pub fn lens(
         entries.clone(),
     )
     .save(out, "beltgauge calibrate lens")?;
-    report::lens(&page, board, &shots, &entries, &calibration)?;
+    report::lens(&page, board, size_px, &shots, &entries, &calibration)?;
     for entry in &entries {
         say(&entry_line(entry))?;
     }
@@ -89,11 +99,12 @@ pub fn belt(
     let elsewhere = files_of(elsewhere)?;
     let page = report_beside(out, &[&carried, &elsewhere, &[lens_file.to_owned()]])?;
     let files = [&carried[..], &elsewhere].concat();
-    let shots = look(&files, Some(lens.image_size_px), board, say)?;
+    let stills = load(&files)?;
+    let shots = look(&files, stills, lens.image_size_px, board, say)?;
     let mut stills = Vec::with_capacity(shots.len());
     for shot in &shots {
         let board_image = shot.board.as_ref().map_err(|reason| {
-            Error::configuration(not_found(board, *reason))
+            Error::configuration(no_use(board, &shot.still, *reason))
                 .at(&shot.name)
                 .remedy("take this still again, with the whole board in the image")
         })?;
@@ -173,46 +184,96 @@ fn files_of(images: &[PathBuf]) -> Result<Vec<PathBuf>> {
     Ok(files)
 }
 
-/// Load every image and look for the board.
+/// Load every image: they may come from a stranger's stick.
+fn load(files: &[PathBuf]) -> Result<Vec<Still>> {
+    if files.is_empty() {
+        return Err(Error::configuration("no images")
+            .remedy("name the image files, or a folder that holds them"));
+    }
+    files
+        .iter()
+        .map(|path| {
+            let still = Still::load_sandboxed(path)?;
+            check_sides(path, still.size_px)?;
+            Ok(still)
+        })
+        .collect()
+}
+
+/// The size of more stills than any other's: the camera's.
+fn size_of_most(files: &[PathBuf], stills: &[Still]) -> Result<[usize; 2]> {
+    let count = |size: [usize; 2]| stills.iter().filter(|s| s.size_px == size).count();
+    let largest = stills.iter().map(|s| count(s.size_px)).max().unwrap_or(0);
+    let mut most = stills.iter().zip(files).filter(|(s, _)| count(s.size_px) == largest);
+    let (first, first_file) = most.next().ok_or_else(|| Error::configuration("no images"))?;
+    match most.find(|(s, _)| s.size_px != first.size_px) {
+        None => Ok(first.size_px),
+        Some((other, other_file)) => {
+            let ([w, h], [a, b]) = (first.size_px, other.size_px);
+            let (name, other_name) = (name_of(first_file), name_of(other_file));
+            Err(Error::configuration(format!(
+                "{largest} images of {w} x {h} px as {name}, {largest} of {a} x {b} px as {other_name}"
+            ))
+            .allowed("one size, or most of one size")
+            .remedy("use images of one camera with one setting, none cropped, scaled or turned"))
+        }
+    }
+}
+
+/// Look for the board in every image of the right size.
 fn look(
     files: &[PathBuf],
-    size_px: Option<[usize; 2]>,
+    stills: Vec<Still>,
+    size_px: [usize; 2],
     board: &Chessboard,
     say: &mut dyn FnMut(&str) -> Result<()>,
 ) -> Result<Vec<Shot>> {
     let mut shots: Vec<Shot> = Vec::with_capacity(files.len());
-    for (number, path) in files.iter().enumerate() {
-        let expected = size_px.or(shots.first().map(|s| s.still.size_px));
-        // They may come from a stranger's stick.
-        let still = Still::load_sandboxed(path)?;
-        check_size(path, still.size_px, expected)?;
+    for (number, (path, still)) in files.iter().zip(stills).enumerate() {
         let plane =
             still.plane().ok_or_else(|| Error::failure("an image without pixels").in_file(path))?;
-        let found = board.find(plane);
-        let name = path.file_name().unwrap_or(path.as_os_str()).to_string_lossy().into_owned();
+        let found = if still.size_px == size_px {
+            board.find(plane).map_err(NoUse::NoBoard)
+        } else {
+            Err(NoUse::NotOfSize(size_px))
+        };
+        let name = name_of(path);
         let outcome = match &found {
             Ok(image) => format!("{} corners", image.corners.len()),
-            Err(reason) => not_found(board, *reason),
+            Err(reason) => no_use(board, &still, *reason),
         };
         say(&format!("{:>3}/{} {name:24} {outcome}", number + 1, files.len()))?;
         shots.push(Shot { name, still, board: found });
     }
-    if shots.is_empty() {
-        return Err(Error::configuration("no images")
-            .remedy("name the image files, or a folder that holds them"));
-    }
     Ok(shots)
 }
 
-fn not_found(board: &Chessboard, reason: NotFound) -> String {
-    let Chessboard { columns, rows, .. } = board;
+fn name_of(path: &Path) -> String {
+    path.file_name().unwrap_or(path.as_os_str()).to_string_lossy().into_owned()
+}
+
+/// Why a still is of no use, in words.
+fn no_use(board: &Chessboard, still: &Still, reason: NoUse) -> String {
+    let wanted = board.in_order([board.columns, board.rows]);
     match reason {
-        NotFound::NoGrid => format!("no board of {columns}x{rows} inner corners"),
-        NotFound::AnotherGrid { size: [a, b], seen } if [a, b] == [*columns, *rows] => {
+        NoUse::NoBoard(NotFound::NoGrid) => format!("no board of {wanted} inner corners"),
+        NoUse::NoBoard(NotFound::Markers) => {
+            "looks like a ChArUco board, with markers in its squares: use a plain chessboard".into()
+        }
+        NoUse::NoBoard(NotFound::AnotherGrid { size, seen })
+            if size == [board.columns, board.rows] =>
+        {
             format!("only {seen} of the board's {} corners", board.corner_count())
         }
-        NotFound::AnotherGrid { size: [a, b], .. } => {
-            format!("{a}x{b} inner corners, not {columns}x{rows}")
+        NoUse::NoBoard(NotFound::AnotherGrid { size, .. }) => {
+            format!("{} inner corners, not {wanted}", board.in_order(size))
+        }
+        NoUse::NotOfSize([width, height]) => {
+            let [w, h] = still.size_px;
+            format!(
+                "{w} x {h} px, not {width} x {height}: use images of one camera with one setting, none \
+                 cropped, scaled or turned"
+            )
         }
     }
 }
@@ -221,10 +282,12 @@ fn not_found(board: &Chessboard, reason: NotFound) -> String {
 fn seen_summary(board: &Chessboard, shots: &[Shot]) -> String {
     let found = shots.iter().filter(|s| s.board.is_ok()).count();
     let summary = format!("{} images, the board found in {found}", shots.len());
-    let other =
-        shots.iter().find_map(|s| s.board.as_ref().err().filter(|e| **e != NotFound::NoGrid));
-    match other {
-        Some(reason) if found == 0 => format!("{summary} (--board: {})", not_found(board, *reason)),
+    // The most telling: what another one says of the size hides what is seen of the board.
+    let telling = |shot: &&Shot| matches!(&shot.board, Err(NoUse::NoBoard(reason)) if *reason != NotFound::NoGrid);
+    match shots.iter().find(telling) {
+        Some(Shot { still, board: Err(reason), .. }) if found == 0 => {
+            format!("{summary} (--board: {})", no_use(board, still, *reason))
+        }
         _ => summary,
     }
 }
@@ -240,7 +303,7 @@ fn lens_entries(
         .map(|shot| {
             let file = shot.name.clone();
             let (rms_px, rejected) = match &shot.board {
-                Err(reason) => (None, Some(not_found(board, *reason))),
+                Err(reason) => (None, Some(no_use(board, &shot.still, *reason))),
                 Ok(_) => views.next().map_or((None, None), |v| (v.rms_px, v.rejected.clone())),
             };
             ImageEntry { file, rms_px, rejected }
@@ -280,20 +343,15 @@ fn belt_summary(table: &BeltTable) -> String {
     )
 }
 
-/// The size of an image must be possible, and that of the others or the lens.
-fn check_size(path: &Path, size_px: [usize; 2], expected: Option<[usize; 2]>) -> Result<()> {
-    let [width, height] = size_px;
-    let wrong = || Error::configuration(format!("an image of {width} x {height} px")).in_file(path);
-    let (from, to) = (IMAGE_SIDE_PX.start(), IMAGE_SIDE_PX.end());
-    match expected {
-        Some([w, h]) if size_px != [w, h] => Err(wrong()
-            .allowed(format!("{w} x {h} px, as the other images and the lens"))
-            .remedy("use images of one camera with one setting, none cropped, scaled or turned")),
-        _ if size_px.iter().any(|side| !IMAGE_SIDE_PX.contains(side)) => {
-            Err(wrong().allowed(format!("sides of {from} to {to} px")))
-        }
-        _ => Ok(()),
+/// An image of impossible size is none of a camera's.
+fn check_sides(path: &Path, [width, height]: [usize; 2]) -> Result<()> {
+    if [width, height].iter().all(|side| IMAGE_SIDE_PX.contains(side)) {
+        return Ok(());
     }
+    let (from, to) = (IMAGE_SIDE_PX.start(), IMAGE_SIDE_PX.end());
+    Err(Error::configuration(format!("an image of {width} x {height} px"))
+        .in_file(path)
+        .allowed(format!("sides of {from} to {to} px")))
 }
 
 /// Where the report goes: beside the camera file, as .html. Refuses, before any work, an output

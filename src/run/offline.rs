@@ -97,6 +97,9 @@ pub fn measure(
             if let Some(doubt) = source.doubt() {
                 observer.doubt(&doubt);
             }
+            if let Some(doubt) = gap_doubt(pipeline.untold_gaps()) {
+                observer.doubt(&doubt);
+            }
             if let Some(doubt) = belt_doubt(&pipeline) {
                 observer.doubt(&doubt);
             }
@@ -108,6 +111,16 @@ pub fn measure(
             return Ok(pipeline.counters());
         }
     }
+}
+
+/// Frames that are missing in a recording without times of its own.
+fn gap_doubt(frames: u64) -> Option<String> {
+    (frames > 0).then(|| {
+        format!(
+            "the recording lacks {frames} frames, by the belt's steps: its travel was measured over them, but \
+             times and speeds are wrong by as much: record without dropping frames"
+        )
+    })
 }
 
 /// What of the belt is not as the configuration says, at the end of a recording.

@@ -4,6 +4,7 @@ use super::Pose;
 use super::bundle::{Bundle, Observation, View, board_pose};
 use super::homography::{homography, zhang};
 use super::least_squares::{Normal, minimise};
+use super::turned::{TurnedView, turned_back_rms_px, turned_views};
 use super::verdict;
 use crate::camera::chessboard::{BoardImage, Chessboard, Corner};
 use crate::camera::{LENS_PARAMETERS, Lens, LensModel};
@@ -93,8 +94,57 @@ pub fn calibrate_lens(
     start: LensStart,
     shape: BoardShape,
 ) -> Result<LensCalibration> {
+    let settle = |look| settle(board, image_size_px, images, model, start, shape, look);
+    let mut settled = settle(LookForTurned::Yes)?;
+    // Of another camera, or of no one lens at all, a turned view would not fit the others either.
+    let fits = |&v: &usize| {
+        let error_px = turned_back_rms_px(board, image_size_px, &settled.fitted, &images[v]);
+        error_px.is_some_and(|rms| {
+            !verdict::is_bad(&settled.fitted.view_rms_px, rms, VIEW_RATIO, VIEW_RMS_PX)
+        })
+    };
+    if !settled.turned.iter().all(fits) {
+        settled = settle(LookForTurned::No)?;
+    }
+    let Settled { rejected, kept, fitted, turned } = settled;
+    let mut calibration = summarise(board, images, &rejected, &kept, &fitted)?;
+    verdict::check(board, image_size_px, images, &kept, start, &mut calibration)?;
+    calibration.warnings.extend(verdict::turned_warning(turned.len()));
+    Ok(calibration)
+}
+
+/// Whether views may have been turned by 180 degrees.
+#[derive(Clone, Copy, PartialEq, Eq)]
+enum LookForTurned {
+    Yes,
+    No,
+}
+
+/// A fit of what belongs together.
+struct Settled {
+    fitted: Fitted,
+    /// Numbers of the views fitted.
+    kept: Vec<usize>,
+    /// Why others are not.
+    rejected: Vec<Option<String>>,
+    /// Those that seem to be turned.
+    turned: Vec<usize>,
+}
+
+/// Fit, reject the view that belongs least, and again, until all belong.
+fn settle(
+    board: &Chessboard,
+    image_size_px: [usize; 2],
+    images: &[BoardImage],
+    model: LensModel,
+    start: LensStart,
+    shape: BoardShape,
+    look: LookForTurned,
+) -> Result<Settled> {
     let mut rejected = verdict::unusable(images, SMEAR_PX_MAX, VIEWS_MIN);
+    let mut turned = Vec::new();
     let mut found: Option<(Lens, Vec<Pose>)> = None;
+    let mut look = look;
     loop {
         let kept: Vec<usize> = (0..images.len()).filter(|&v| rejected[v].is_none()).collect();
         if kept.len() < VIEWS_MIN {
@@ -106,17 +156,36 @@ pub fn calibrate_lens(
             None => initial(board, image_size_px, &views, model, start)?,
         };
         let mut fitted = fit(board, views, first, shape)?;
-        if let Some(worst) = verdict::worst_view(&fitted, VIEW_RATIO, VIEW_RMS_PX)
-            && kept.len() > VIEWS_MIN
-        {
-            rejected[kept[worst]] = Some(verdict::does_not_belong(&fitted, worst));
-            fitted.poses.remove(worst);
-            found = Some((fitted.lens, fitted.poses));
-            continue;
+        if std::mem::replace(&mut look, LookForTurned::No) == LookForTurned::Yes {
+            let seen: Vec<BoardImage> = kept.iter().map(|&v| images[v].clone()).collect();
+            let refit = |images: &[BoardImage], lens: &Lens| {
+                let poses: Option<Vec<Pose>> =
+                    images.iter().map(|i| board_pose(board, lens, &i.corners)).collect();
+                let views = images.iter().map(View::all_of).collect();
+                fit(board, views, (lens.clone(), poses?), shape).ok()
+            };
+            let (all, rms_px) =
+                turned_views(board, image_size_px, &seen, &fitted, &refit).unwrap_or_default();
+            // What does not fit turned back either has another fault.
+            let belongs =
+                |t: &TurnedView| !verdict::is_bad(&rms_px, t.rms_px[1], VIEW_RATIO, VIEW_RMS_PX);
+            for back in all.iter().filter(|t| belongs(t)) {
+                turned.push(kept[back.view]);
+                rejected[kept[back.view]] = Some(verdict::is_turned(back));
+            }
+            if !turned.is_empty() {
+                continue;
+            }
         }
-        let mut calibration = summarise(board, images, &rejected, &kept, &fitted)?;
-        verdict::check(board, image_size_px, images, &kept, start, &mut calibration)?;
-        return Ok(calibration);
+        let worst = verdict::worst_view(&fitted, VIEW_RATIO, VIEW_RMS_PX);
+        match worst.filter(|_| kept.len() > VIEWS_MIN) {
+            None => return Ok(Settled { fitted, kept, rejected, turned }),
+            Some((worst, reason)) => {
+                rejected[kept[worst]] = Some(reason);
+                fitted.poses.remove(worst);
+                found = Some((fitted.lens, fitted.poses));
+            }
+        }
     }
 }
 

@@ -10,6 +10,7 @@ mod homography;
 mod least_squares;
 mod lens;
 mod points;
+mod turned;
 mod verdict;
 
 pub use belt::{BeltCalibration, BeltStill, StillResult, calibrate_belt};

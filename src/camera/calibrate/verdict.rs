@@ -1,6 +1,7 @@
 //! What is wrong with a calibration, in plain words, and what to photograph next.
 
 use super::lens::{Fitted, LensCalibration, LensStart};
+use super::turned::TurnedView;
 use crate::camera::chessboard::{BoardImage, Chessboard, median};
 use crate::error::{Error, Result};
 use crate::units::RawPx;
@@ -19,8 +20,9 @@ const ASPECT_MAX: f64 = 0.1;
 const ASPECT_WANTED: f64 = 0.01;
 /// The principal point is near the centre, as part of the image's side.
 const CENTRE_WANTED: f64 = 0.1;
-/// Sharp images of a flat board reach a tenth of this.
-const RMS_PX_WANTED: f64 = 1.0;
+/// Part of the longer side: 1 px of the reference camera's 1920. Heights inherit angles, and sharp
+/// images of a flat board reach a tenth of this.
+const RMS_WANTED: f64 = 1.0 / 1920.0;
 /// A data sheet is right to this part.
 const DATA_SHEET: f64 = 0.1;
 /// Scale of the hyperbolic tangent to the length of the ramp that motion makes: both have the
@@ -75,14 +77,37 @@ pub(super) fn unusable(
     reasons
 }
 
-/// The view with the largest error, when it does not belong to the others.
-pub(super) fn worst_view(fitted: &Fitted, ratio: f64, rms_px_min: f64) -> Option<usize> {
+/// The view with the largest error, when it does not belong to the others, and why.
+pub(super) fn worst_view(fitted: &Fitted, ratio: f64, rms_px_min: f64) -> Option<(usize, String)> {
     let rms = &fitted.view_rms_px;
     let worst = (0..rms.len()).max_by(|&a, &b| rms[a].total_cmp(&rms[b]))?;
-    (rms[worst] > (ratio * median(rms.clone())).max(rms_px_min)).then_some(worst)
+    is_bad(rms, rms[worst], ratio, rms_px_min).then(|| (worst, does_not_belong(fitted, worst)))
 }
 
-pub(super) fn does_not_belong(fitted: &Fitted, view: usize) -> String {
+/// Whether a view of such an error does not belong to the others.
+pub(super) fn is_bad(all_px: &[f64], rms_px: f64, ratio: f64, rms_px_min: f64) -> bool {
+    rms_px > (ratio * median(all_px.to_vec())).max(rms_px_min)
+}
+
+pub(super) fn is_turned(turned: &TurnedView) -> String {
+    let [as_it_is, turned_back] = turned.rms_px;
+    format!(
+        "turned by 180 degrees against the others: error of {as_it_is:.2} px as it is, of {turned_back:.2} px turned back: use \
+         images as the camera delivers them, all of one mounting"
+    )
+}
+
+/// Where both kinds are about as telling, those kept may be the wrong ones.
+pub(super) fn turned_warning(count: usize) -> Option<String> {
+    (count > 0).then(|| {
+        format!(
+            "{count} images seem to be turned by 180 degrees against the others, or the others against them: \
+             the principal point may be wrong. Use images as the camera delivers them, all of one mounting"
+        )
+    })
+}
+
+fn does_not_belong(fitted: &Fitted, view: usize) -> String {
     let rms = &fitted.view_rms_px;
     format!(
         "error of {:.2} px where the others have {:.2} px: moved, blurred, or not this board",
@@ -104,6 +129,7 @@ pub(super) fn check(
     check_views(images, kept, calibration, &mut warnings)?;
     check_lens(image_size_px, start, calibration, &mut warnings)?;
     check_coverage(image_size_px, images, kept, calibration, &mut warnings)?;
+    check_rms(image_size_px, calibration, &mut warnings);
     check_board(board, calibration, &mut warnings);
     calibration.warnings = warnings;
     Ok(())
@@ -292,14 +318,24 @@ fn check_coverage(
     Ok(())
 }
 
-fn check_board(board: &Chessboard, calibration: &LensCalibration, warnings: &mut Vec<String>) {
-    if calibration.rms_px > RMS_PX_WANTED {
+/// The error against what the image's resolution makes of it.
+fn check_rms(
+    [width, height]: [usize; 2],
+    calibration: &LensCalibration,
+    warnings: &mut Vec<String>,
+) {
+    let wanted_px = RMS_WANTED * width.max(height) as f64;
+    if calibration.rms_px > wanted_px {
         warnings.push(format!(
-            "the corners are off by {:.2} px (rms), sharp images of a flat board reach 0.1: \
-             check that it is flat, the focus fixed and the model right",
+            "the corners are off by {:.2} px (rms), too much for images of {width} x {height} px (below \
+             {wanted_px:.2}; sharp ones of a flat board reach 0.1): check that it is flat, the focus \
+             fixed, the model right, and that all images are of one camera, none scaled or turned",
             calibration.rms_px
         ));
     }
+}
+
+fn check_board(board: &Chessboard, calibration: &LensCalibration, warnings: &mut Vec<String>) {
     let outliers: usize = calibration.views.iter().map(|v| v.outliers).sum();
     if outliers > 0 {
         warnings.push(format!(
@@ -310,10 +346,9 @@ fn check_board(board: &Chessboard, calibration: &LensCalibration, warnings: &mut
     let bend_mm = bends().fold(f64::MIN, f64::max) - bends().fold(f64::MAX, f64::min);
     if bend_mm > 0.0 {
         warnings.push(format!(
-            "the board is not flat: over its {} x {} squares it bends by {bend_mm:.1} mm. Its shape \
+            "the board is not flat: over its {} squares it bends by {bend_mm:.1} mm. Its shape \
              was estimated too; a board on glass or aluminium is better",
-            board.columns + 1,
-            board.rows + 1
+            board.in_order([board.columns + 1, board.rows + 1])
         ));
     }
 }

@@ -6,6 +6,7 @@
 mod corners;
 mod grey;
 mod grid;
+mod markers;
 mod refine;
 mod saddle;
 
@@ -25,6 +26,8 @@ pub struct Chessboard {
     pub rows: usize,
     /// Side of a square.
     pub square_mm: f64,
+    /// The shorter side was named first: so do messages.
+    pub shorter_first: bool,
 }
 
 /// An inner corner of the board that was found.
@@ -60,6 +63,8 @@ pub enum NotFound {
         /// Corners seen.
         seen: usize,
     },
+    /// A board whose bright squares hold markers.
+    Markers,
 }
 
 /// Coarsest image that is searched, along its longer side.
@@ -72,10 +77,15 @@ const SEEN_MIN: f64 = 0.9;
 const GRIDS_MAX: usize = 6;
 
 impl Chessboard {
-    /// A board; the order of the two counts does not matter.
+    /// A board; the order of the two counts matters for messages only.
     pub fn new(corners: [usize; 2], square_mm: f64) -> Self {
         let [a, b] = corners;
-        Self { columns: a.max(b), rows: a.min(b), square_mm }
+        Self { columns: a.max(b), rows: a.min(b), square_mm, shorter_first: a < b }
+    }
+
+    /// Two counts, the longer side's first, as text in the order in which the board was named.
+    pub fn in_order(&self, [long, short]: [usize; 2]) -> String {
+        if self.shorter_first { format!("{short}x{long}") } else { format!("{long}x{short}") }
     }
 
     /// Corners of the whole board.
@@ -119,6 +129,7 @@ impl Chessboard {
                 corners.complete(full, [self.columns, self.rows]);
                 match self.ordered(&corners) {
                     Ok(found) => return Ok(found),
+                    Err(_) if markers::fill(full, grid, halvings) => failure = NotFound::Markers,
                     Err(reason) => failure = failure.nearer(reason),
                 }
             }
@@ -199,6 +210,7 @@ impl NotFound {
     /// The more telling of two failures.
     fn nearer(self, other: Self) -> Self {
         match (self, other) {
+            (Self::Markers, _) | (_, Self::Markers) => Self::Markers,
             (Self::AnotherGrid { seen: a, .. }, Self::AnotherGrid { seen: b, .. }) if a >= b => {
                 self
             }

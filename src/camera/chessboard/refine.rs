@@ -13,8 +13,8 @@ const WINDOW: f64 = 0.47;
 const WINDOW_PX_MAX: f64 = 16.0;
 /// Parameters: corner x, y; both edges' angles; both edges' log blur; contrast; level; shade x, y.
 const PARAMETERS: usize = 10;
-/// A fit with fewer pixels a parameter than three says nothing.
-const PIXELS_MIN: usize = 3 * PARAMETERS;
+/// A fit with fewer pixels a parameter than two says nothing: squares of 5 px have 22.
+const PIXELS_MIN: usize = 2 * PARAMETERS;
 const STEPS_MAX: usize = 25;
 /// The fit must explain the window but for this part of the contrast (root mean square).
 const RESIDUAL_MAX: f64 = 0.5;

@@ -17,8 +17,6 @@ use heapless::Deque;
 use std::io::{Error, ErrorKind};
 use std::time::{Duration, Instant};
 
-const HEARTBEAT_PERIOD: Duration = Duration::from_millis(100);
-const STATUS_PERIOD: Duration = Duration::from_secs(1);
 /// An interface that is not there is looked for this often.
 const REOPEN_PERIOD: Duration = Duration::from_secs(1);
 /// The carrier is looked at this often.
@@ -262,7 +260,7 @@ impl<B: Bus> CanLink<B> {
         if let Some(result) = self.results.pop_front() {
             emit(result);
         } else if now >= self.heartbeat_due {
-            self.heartbeat_due = now + HEARTBEAT_PERIOD;
+            self.heartbeat_due = now + frames::HEARTBEAT_PERIOD;
             frames::heartbeat(link.status(), emit);
         } else if reachable && self.repeat > 0 {
             if let Some(record) = self.recent.iter().nth(self.recent.len() - self.repeat) {
@@ -276,7 +274,7 @@ impl<B: Bus> CanLink<B> {
             }
             let _ = self.recent.push_back(record); // invariant: there is room
         } else if now >= self.status_due {
-            self.status_due = now + STATUS_PERIOD;
+            self.status_due = now + frames::STATUS_PERIOD;
             self.counter = self.counter.wrapping_add(1);
             frames::status(link.status(), self.counter, &mut emit);
         }

@@ -16,11 +16,11 @@ use std::path::Path;
 pub(in crate::run) fn lens(
     path: &Path,
     board: &Chessboard,
+    size_px: [usize; 2],
     shots: &[Shot],
     entries: &[ImageEntry],
     calibration: &LensCalibration,
 ) -> Result<()> {
-    let size_px = shots[0].still.size_px;
     let mut page = Page::new("Lens calibration");
     page.warnings(&calibration.warnings);
     page.table(&parameters(calibration, size_px));

@@ -6,7 +6,8 @@
 //! not add up frame by frame; a new key is taken when the overlap gets small. In the belt
 //! view all belt motion is horizontal, so a match is one number.
 //! While it is not locked, a few of the rows are searched over every speed in both directions, and
-//! several frames must agree. A texture that fits itself at several plausible shifts is ambiguous,
+//! several frames must agree; but a whole multiple of the last step is one at once: frames are missing
+//! whose time stamps do not tell. A texture that fits itself at several plausible shifts is ambiguous,
 //! and silhouettes that move otherwise refute what the texture shows: neither is a measurement.
 //! Cost: at most 250,000 pixels taken out, and as many products for each shift tried, 13 when locked;
 //! bounded by the zone, whatever the time stamps say.
@@ -131,6 +132,8 @@ pub struct Odometry {
     locked: bool,
     /// Frames without a match since the last one.
     misses: u32,
+    /// Frames that were missing though the time stamps did not tell.
+    untold_gaps: u64,
 }
 
 struct Match {
@@ -138,6 +141,8 @@ struct Match {
     pairs: u32,
     /// Root of the texture's covariance, grey levels.
     texture_grey: f64,
+    /// Frames missing before this one, by its step: its time is as much more than its stamp.
+    missing: u32,
 }
 
 /// Sums over both textures at one shift.
@@ -212,6 +217,7 @@ impl Odometry {
             knowledge: Knowledge::default(),
             locked: false,
             misses: 0,
+            untold_gaps: 0,
         })
     }
 
@@ -241,6 +247,9 @@ impl Odometry {
         let step_px = found.as_ref().map_or(assumed_px, |m| m.shift_px - last_px);
         let step_mm = step_px * self.mm_per_px;
         if let Some(m) = found {
+            self.untold_gaps += u64::from(m.missing);
+            self.key_age_s += dt_s * f64::from(m.missing);
+            let dt_s = dt_s * f64::from(1 + m.missing);
             if dt_s > 0.0 {
                 self.speed_mm_per_s += SPEED_FOLLOW * (step_mm / dt_s - self.speed_mm_per_s);
             }
@@ -324,6 +333,11 @@ impl Odometry {
         self.expected.magnification_max
     }
 
+    /// Frames that the belt's steps show to be missing, though the time stamps do not tell.
+    pub fn untold_gaps(&self) -> u64 {
+        self.untold_gaps
+    }
+
     /// What is known of the belt's motion.
     pub fn knowledge(&self) -> Knowledge {
         self.knowledge
@@ -400,12 +414,24 @@ impl Odometry {
                 self.knowledge = Knowledge::Ambiguous;
                 None
             }
-            (None, _) => self.look_far(dt_s),
+            (None, _) => self.look_far(last_px, dt_s),
         }
     }
 
-    /// A speed far from the nominal one, in either direction, that several frames on end show.
-    fn look_far(&mut self, dt_s: f64) -> Option<Match> {
+    /// Frames missing before this one, when its step is a whole multiple of what the locked speed makes
+    /// of its time: no belt doubles its speed from one frame to the next.
+    fn missing(&self, step_px: f64, dt_s: f64) -> u32 {
+        let usual_px = self.speed_mm_per_s * dt_s / self.mm_per_px;
+        let moves = self.speed_mm_per_s.abs() > SLOW * self.expected.nominal_mm_per_s;
+        let times = (step_px / usual_px).round();
+        // A shift is known to a px.
+        let whole = (step_px - times * usual_px).abs() < SCOUT_AGREE * step_px.abs() + 1.0;
+        if self.locked && moves && whole && times >= 2.0 { times as u32 - 1 } else { 0 }
+    }
+
+    /// A speed far from the nominal one, in either direction, that several frames on end show, or the
+    /// usual one over missing frames.
+    fn look_far(&mut self, last_px: f64, dt_s: f64) -> Option<Match> {
         let most = self.shift_max_px();
         // What stands still in the picture is no motion.
         let peaks = self.peaks(-most, most, Some(0));
@@ -417,6 +443,11 @@ impl Odometry {
             self.knowledge = Knowledge::Ambiguous;
             self.seen = None;
             return None;
+        }
+        let missing = self.missing(shift as f64 - last_px, dt_s);
+        if missing > 0 {
+            let found = self.best(shift as f64 - 2.0, shift as f64 + 2.0)?;
+            return Some(Match { missing, ..found });
         }
         let speed = shift as f64 * self.mm_per_px / self.key_age_s;
         let agreed = match self.seen {
@@ -488,7 +519,8 @@ impl Odometry {
         }
         let around = known.1.map(|c| c.rho);
         let texture_grey = self.unit_grey * c.covariance.max(0.0).sqrt();
-        Some(Match { shift_px: shift as f64 + peak(&around)?, pairs: c.pairs, texture_grey })
+        let shift_px = shift as f64 + peak(&around)?;
+        Some(Match { shift_px, pairs: c.pairs, texture_grey, missing: 0 })
     }
 
     /// Normalised correlation of key and current texture, and the pixels that took part, the belt
