@@ -4,9 +4,8 @@
 //! A sorter needs each parcel once. So the travel over the gap is looked for, best witness first: the
 //! encoder; the belt's texture, before and after; parcels that are where they were, or where the last
 //! speed has carried them. With any of these parcels are followed on, or told as having left. Without,
-//! what was in view is told as lost, and what is in view is new; but where the belt has no texture that
-//! could show that it is new, what looks like a parcel from before is that parcel, and is told once, when
-//! it leaves.
+//! what was in view is told as lost, and what is in view is new; but what the belt's texture does not
+//! show to be new, and looks like a parcel from before, is that parcel, and is told once, when it leaves.
 
 use super::{Pipeline, Reference};
 use crate::event::{Flags, NotMeasured, ParcelRecord};
@@ -46,7 +45,7 @@ impl Pipeline {
             Across::Travel(step_mm) => {
                 (parcels(step_mm) != Seen::Missing).then_some(Motion { step_mm, measured: true })
             }
-            Across::Beyond => None,
+            Across::Beyond(_) => None,
             Across::Unknown => {
                 let assumed_mm = self.odometry.speed().0 * dt_s;
                 [(0.0, true), (assumed_mm, false)]
@@ -69,10 +68,16 @@ impl Pipeline {
         self.at.lose();
         let travel_max_mm = self.odometry.travel_max_mm(dt_s);
         for slot in 0..self.tracker.tracks().len() {
-            let again = match seen {
-                Across::Unknown => self.tracker.again(slot, self.segment.blobs(), travel_max_mm),
-                Across::Travel(_) | Across::Beyond => None,
+            let travel_min_mm = match seen {
+                Across::Unknown => Some(0.0),
+                Across::Beyond(mm) => Some(mm),
+                // Refuted: the belt has come round.
+                Across::Travel(_) => None,
             };
+            let again = travel_min_mm.and_then(|travel_min_mm| {
+                let travel_mm = travel_min_mm..=travel_max_mm;
+                self.tracker.again(slot, self.segment.blobs(), travel_mm)
+            });
             match (self.tracker.tracks()[slot].phase, again) {
                 (Phase::Riding | Phase::Left, Some(bounds)) => {
                     self.tracker.restart(slot, bounds, self.at);

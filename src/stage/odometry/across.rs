@@ -14,8 +14,8 @@ const BACK_SHARE: f64 = 0.05;
 pub enum Across {
     /// So much, mm.
     Travel(f64),
-    /// More than the view shows.
-    Beyond,
+    /// More than this, mm: more than the zone shows.
+    Beyond(f64),
     /// Nothing.
     Unknown,
 }
@@ -54,7 +54,11 @@ impl Odometry {
             let [here, ..] = self.correlations(0);
             self.take_key();
             let would_show = follows && was_known && here.pairs >= 2 * PAIRS_MIN;
-            return if would_show { Across::Beyond } else { Across::Unknown };
+            return if would_show {
+                Across::Beyond(most * self.mm_per_px)
+            } else {
+                Across::Unknown
+            };
         };
         self.take_key();
         Across::Travel(found.shift_px * self.mm_per_px)

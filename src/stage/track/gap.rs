@@ -4,6 +4,7 @@ use super::state::FREE;
 use super::{OVERLAP_MIN, Phase, Track, Tracker};
 use crate::belt::BeltPosition;
 use crate::stage::segment::{Blob, PxBox};
+use std::ops::RangeInclusive;
 
 /// The belt carries along rows: the ends of a silhouette across them stay where they are but for
 /// noise and a little of its shadow.
@@ -57,18 +58,24 @@ impl Tracker {
         }
     }
 
-    /// The box of what may be a track's parcel after it was carried on by anything up to
-    /// `travel_max_mm`, and is no other track's already.
-    pub fn again(&self, slot: usize, blobs: &[Blob], travel_max_mm: f64) -> Option<PxBox> {
+    /// The box of what may be a track's parcel after it was carried on by a travel in
+    /// this range, and is no other track's already.
+    pub fn again(
+        &self,
+        slot: usize,
+        blobs: &[Blob],
+        travel_mm: RangeInclusive<f64>,
+    ) -> Option<PxBox> {
         let track = &self.tracks[slot];
         if !track.is_parcel() {
             return None;
         }
-        let most_px = (travel_max_mm / self.mm_per_px * self.magnification_max) as f32 + SAME_PX;
+        let least_px = (travel_mm.start() / self.mm_per_px) as f32 - SAME_PX;
+        let most_px = (travel_mm.end() / self.mm_per_px * self.magnification_max) as f32 + SAME_PX;
         let length = |b: &PxBox| b.u1 - b.u0;
         let taken = |b: &PxBox| self.tracks[..slot].iter().any(|t| t.is_parcel() && t.bounds == *b);
         let may_be = |b: &&PxBox| {
-            (-SAME_PX..=most_px).contains(&(b.u0 - track.bounds.u0))
+            (least_px..=most_px).contains(&(b.u0 - track.bounds.u0))
                 && is_as_wide(track, b)
                 && (length(b) - length(&track.bounds)).abs() < SAME_LENGTH * length(&track.bounds)
                 && !taken(b)
