@@ -169,6 +169,10 @@ impl Link {
     /// A state file that could not be read at the start has turned up: what it keeps holds again, but
     /// for what this run was told since. What waited in it to be acknowledged goes first.
     fn meet(&mut self) {
+        // What holds again may be two requests.
+        if self.requests.len() + self.decided.len() + 2 > REQUESTS_MAX {
+            return;
+        }
         let Some(unacknowledged) = self.journal.meet() else { return };
         let state = *self.journal.state();
         if self.settings.queue {
@@ -178,12 +182,12 @@ impl Link {
             }
         }
         if state.stopped != self.status.stopped {
-            let _ = self.requests.push_back(Request::Report(!state.stopped));
+            let _ = self.requests.push_back(Request::Report(!state.stopped)); // invariant: there is room
         }
         let mm_per_count =
             self.configured_mm_per_count.map(|mm| Override::of(state.mm_per_count, mm));
         if let Some(set) = mm_per_count.filter(|_| mm_per_count != self.status.mm_per_count) {
-            let _ = self.requests.push_back(Request::MmPerCount(set));
+            let _ = self.requests.push_back(Request::MmPerCount(set)); // invariant: there is room
             self.status.mm_per_count = mm_per_count;
         }
         self.status.boots = state.boots;
