@@ -19,7 +19,7 @@ impl Flags {
     pub const HEIGHT_UNCERTAIN: Self = Self(1 << 3);
     /// The belt speed was assumed, not measured, for most of the pass.
     pub const SPEED_ASSUMED: Self = Self(1 << 4);
-    /// It vanished inside the zone.
+    /// It vanished inside the zone, or over a gap in the frames.
     pub const LOST: Self = Self(1 << 5);
     /// Taller than `view.height_max_mm`: nothing of it can be trusted.
     pub const TOO_TALL: Self = Self(1 << 7);
@@ -46,7 +46,7 @@ impl Flags {
             "standard deviation of the height above measure.sigma_max_mm",
         ),
         (Self::SPEED_ASSUMED, "speed_assumed", "belt speed assumed, not measured: trust no height"),
-        (Self::LOST, "lost", "it vanished inside the zone"),
+        (Self::LOST, "lost", "it vanished inside the zone, or over a gap in the frames"),
         (
             Self::SILHOUETTE_ONLY,
             "silhouette_only",
@@ -150,7 +150,7 @@ pub enum NotMeasured {
     NeverAlone = 2,
     /// It vanished inside the zone before its edges could be measured.
     Lost = 3,
-    /// The belt's motion was not known while it passed.
+    /// The belt's motion was not known while it passed, as over a gap in the frames.
     BeltMotionUnknown = 4,
 }
 
@@ -163,7 +163,7 @@ impl NotMeasured {
         (
             Self::BeltMotionUnknown,
             "belt_motion_unknown",
-            "the belt's motion was not known while it passed",
+            "the belt's motion was not known while it passed, as over a gap in the frames",
         ),
     ];
 }

@@ -18,8 +18,9 @@
 //! - [`store`]: the appliance's disk: configurations in force, sticks, whom it trusts.
 //! - [`run`]: threads and rings; the only room that knows source, pipeline, plc and store.
 //!
-//! Invariants: `pipeline::step` reads no clock and allocates nothing; a record is emitted
-//! once; dependencies point one way (`tests/tidy.rs` checks it).
+//! Invariants: `pipeline::step` reads no clock and allocates nothing; every parcel is told once, also
+//! over frames that are missing (`pipeline/gap.rs` says how); dependencies point one way
+//! (`tests/tidy.rs` checks it).
 //!
 //! Deliberately absent: a framework, plug-ins, a user interface, learning from data, any
 //! claim of legal metrology.

@@ -4,21 +4,23 @@
 //! Owns: every stage, in one mapping planned from the configuration. Reads no clock, draws no
 //! random number, allocates nothing: a recording replays to the same records on every run.
 
+mod gap;
 mod motion;
+mod records;
 
 pub use motion::Health;
 
 use crate::belt::BeltPosition;
 use crate::config::Site;
 use crate::error::{Error, Result};
-use crate::event::{Counters, Flags, NotMeasured, ParcelRecord, Shape};
+use crate::event::{Counters, Flags, NotMeasured, ParcelRecord};
 use crate::image::{FrameTime, Plane};
 use crate::kernel::Level;
 use crate::kernel::scalar::bits::{self, Square, words};
 use crate::plan::{Block, Memory, Plan};
 use crate::stage::background::Background;
 use crate::stage::measure::{self, Frame, Measure, Measured};
-use crate::stage::odometry::{Expected, Odometry};
+use crate::stage::odometry::{Expected, Motion, Odometry};
 use crate::stage::rectify::Rectify;
 use crate::stage::riders::Riders;
 use crate::stage::segment::{PxBox, Segment};
@@ -27,8 +29,6 @@ use crate::units::{BeltMm, BeltPx, BeltRect};
 use motion::Witnesses;
 use nalgebra::Vector2;
 
-/// Above this relative sigma the belt speed counts as assumed.
-const SPEED_SIGMA_MAX: f64 = 0.01;
 /// Around a parcel this many px are not learned as background: its blurred border.
 const HOLD_MARGIN_PX: usize = 2;
 /// Around a parcel this many px are no witness of the belt's motion: blur and compression
@@ -120,7 +120,7 @@ impl Pipeline {
         let segment =
             Segment::new(view.size_px, view.mm_per_px, config.segment.clone(), bands, memory)?;
         let riders = Riders::new(view.mm_per_px, memory)?;
-        let tracker = Tracker::new(view.mm_per_px, magnification_max, memory)?;
+        let tracker = Tracker::new(view.mm_per_px, magnification_max, view.size_px[0], memory)?;
         let measure = Measure::new(
             view.clone(),
             level,
@@ -170,11 +170,12 @@ impl Pipeline {
         self.hold_background();
         self.background.step(self.rectify.pixels(), self.rectify.seen(), &self.hold);
         let by_encoder = self.witnesses.encoder_step_mm();
-        if !self.odometry.bridges(dt_s) {
-            self.lose_belt(emit);
-        }
-        let dt_s = if self.odometry.bridges(dt_s) { dt_s } else { 0.0 };
+        let gap = !self.odometry.bridges(dt_s);
         if !self.background.learned() {
+            let dt_s = if gap { 0.0 } else { dt_s };
+            if gap {
+                self.lose_unlearned_belt();
+            }
             let assumed_mm = self.odometry.speed().0 * dt_s;
             self.witnesses.encoder_alone(by_encoder, dt_s);
             self.at.advance(by_encoder.unwrap_or(assumed_mm), by_encoder.is_some());
@@ -183,17 +184,15 @@ impl Pipeline {
         let background = &self.background;
         self.segment.step(background.foreground(), background.strong(), background.dark());
         self.cover();
-        self.riders.step(self.segment.runs(), self.rectify.seen(), dt_s);
-        let ride = self.riders.ride();
-        let grey = self.rectify.pixels();
-        let texture = self.odometry.step(grey, &self.background, &self.covered, ride, dt_s);
-        let decided = self.witnesses.decide(by_encoder, texture, &self.odometry, ride, dt_s);
-        if decided.changed {
-            self.at.lose();
-        }
-        self.stands_still = decided.stands_still;
-        let motion = decided.motion;
+        let motion = if gap {
+            self.bridge(by_encoder, time, dt_s, emit)
+        } else {
+            self.motion(by_encoder, dt_s)
+        };
         self.at.advance(motion.step_mm, motion.measured);
+        if gap {
+            self.depart(motion.step_mm, emit);
+        }
         self.track(motion.step_mm);
         self.measure_tracks(time, motion.step_mm);
         self.report(emit);
@@ -213,20 +212,18 @@ impl Pipeline {
         self.witnesses.forget_encoder();
     }
 
-    /// Over a gap that the view cannot bridge (frames missing, time stamps that run back) nothing is
-    /// known of the belt: what was inside is told, and followed no more.
-    fn lose_belt(&mut self, emit: &mut dyn FnMut(ParcelRecord)) {
-        for slot in 0..self.tracker.tracks().len() {
-            if self.tracker.tracks()[slot].phase == Phase::Riding {
-                self.counters.lost += 1;
-                self.emit(slot, Flags::LOST, emit);
-            }
+    /// The belt's step since the last frame.
+    fn motion(&mut self, by_encoder: Option<f64>, dt_s: f64) -> Motion {
+        self.riders.step(self.segment.runs(), self.rectify.seen(), dt_s);
+        let ride = self.riders.ride();
+        let grey = self.rectify.pixels();
+        let texture = self.odometry.step(grey, &self.background, &self.covered, ride, dt_s);
+        let decided = self.witnesses.decide(by_encoder, texture, &self.odometry, ride, dt_s);
+        if decided.changed {
+            self.at.lose();
         }
-        self.tracker.forget();
-        self.odometry.forget();
-        self.riders.forget();
-        self.at.lose();
-        self.stands_still = false;
+        self.stands_still = decided.stands_still;
+        decided.motion
     }
 
     /// The belt is empty: forget what it looked like, and the parcels in view, and learn it anew.
@@ -353,24 +350,47 @@ impl Pipeline {
             }
         }
         for slot in 0..self.tracker.tracks().len() {
-            let track = &self.tracker.tracks()[slot];
-            if track.phase != Phase::Riding {
+            if self.tracker.tracks()[slot].phase != Phase::Riding {
                 continue;
             }
-            let trailing_mm = if let Some(outline) = self.measure.outline(slot, self.at) {
-                outline.trailing_x_mm()
-            } else {
-                let px = BeltPx { u: f64::from(track.bounds.u0), v: 0.0 };
-                self.site.view.belt_point(px).x
-            };
-            if trailing_mm > self.zone.x_max_mm {
+            if self.trailing_x_mm(slot, 0.0) > self.zone.x_max_mm {
                 self.emit(slot, Flags::default(), emit);
                 self.tracker.set_left(slot);
             }
         }
     }
 
+    /// Where a parcel ends, by its cuboid, or by its image once that has moved on by `ahead_mm`.
+    fn trailing_x_mm(&self, slot: usize, ahead_mm: f64) -> f64 {
+        if let Some(outline) = self.measure.outline(slot, self.at) {
+            return outline.trailing_x_mm();
+        }
+        let px = BeltPx { u: f64::from(self.tracker.tracks()[slot].bounds.u0), v: 0.0 };
+        self.site.view.belt_point(px).x + ahead_mm
+    }
+
     fn emit(&mut self, slot: usize, flags: Flags, emit: &mut dyn FnMut(ParcelRecord)) {
+        let track = &self.tracker.tracks()[slot];
+        let reason = if self.at.breaks != track.first.breaks {
+            NotMeasured::BeltMotionUnknown
+        } else if flags.has(Flags::LOST) {
+            NotMeasured::Lost
+        } else if track.was_merged() {
+            NotMeasured::NeverAlone
+        } else {
+            NotMeasured::TooBrief
+        };
+        self.tell(slot, flags, reason, emit);
+    }
+
+    /// Emit a parcel, with this reason if it was not measured.
+    fn tell(
+        &mut self,
+        slot: usize,
+        flags: Flags,
+        reason: NotMeasured,
+        emit: &mut dyn FnMut(ParcelRecord),
+    ) {
         if self.passed_beside(slot) || !self.reporting {
             return;
         }
@@ -390,14 +410,15 @@ impl Pipeline {
         let measured = measured.filter(|m| m.has_edges || flags == Flags::default());
         // What vanished before it had a shape was a hand, or a piece that joined its parcel, unless it
         // has ridden through the zone and is as large as a parcel: a sorter must know of it.
-        if measured.is_none() && flags.has(Flags::LOST) && !had_shape && !self.rode(slot) {
+        let vanished = measured.is_none() && reason == NotMeasured::Lost && !had_shape;
+        if vanished && !self.rode(slot) {
             return;
         }
         self.counters.parcels += 1;
         self.counters.unmeasured += u64::from(measured.is_none());
         let record = match measured {
             Some(measured) => self.record(slot, &measured, reference, flags),
-            None => self.record_without_size(slot, flags),
+            None => self.record_without_size(slot, flags, reason),
         };
         emit(record.rounded());
     }
@@ -427,90 +448,6 @@ impl Pipeline {
         self.site.view.belt_point(middle)
     }
 
-    /// Where a parcel is that could not be measured, and why.
-    fn record_without_size(&self, slot: usize, flags: Flags) -> ParcelRecord {
-        let track = &self.tracker.tracks()[slot];
-        let position = self.image_on_belt(slot);
-        let reason = if flags.has(Flags::LOST) {
-            NotMeasured::Lost
-        } else if track.was_merged() {
-            NotMeasured::NeverAlone
-        } else {
-            NotMeasured::TooBrief
-        };
-        let now = self.last.unwrap_or(FrameTime { index: 0, t_s: 0.0 });
-        ParcelRecord {
-            seq: self.counters.parcels as u32,
-            frame: now.index,
-            t_s: now.t_s,
-            length_mm: 0.0,
-            width_mm: 0.0,
-            height_mm: 0.0,
-            yaw_deg: 0.0,
-            x_mm: position.x,
-            y_mm: position.y,
-            sigma_length_mm: 0.0,
-            sigma_width_mm: 0.0,
-            sigma_height_mm: 0.0,
-            belt_speed_mm_per_s: self.belt_motion().0,
-            shape: Shape::Irregular,
-            flags,
-            not_measured: Some(reason),
-            may_be_used: false,
-            belt_travel_mm: self.at.travel_mm,
-            by_encoder: self.by_encoder(),
-        }
-    }
-
-    fn record(
-        &self,
-        slot: usize,
-        measured: &Measured,
-        reference: Reference,
-        flags: Flags,
-    ) -> ParcelRecord {
-        let track = &self.tracker.tracks()[slot];
-        let (p, s) = (&measured.estimate.params, &measured.estimate.sigma);
-        let travel_sigma = self.at.sigma_since(&track.first);
-        let elapsed_s = self.last.map_or(0.0, |last| last.t_s - reference.began_s);
-        let travel_mm = self.at.travel_mm - track.first.travel_mm;
-        let shape = if measured.is_box { Shape::Box } else { Shape::Irregular };
-        let mut record = ParcelRecord {
-            seq: self.counters.parcels as u32,
-            frame: reference.time.index,
-            t_s: reference.time.t_s,
-            length_mm: p[measure::LENGTH],
-            width_mm: p[measure::WIDTH],
-            height_mm: p[measure::HEIGHT],
-            yaw_deg: p[measure::YAW].to_degrees(),
-            x_mm: p[measure::X],
-            y_mm: p[measure::Y],
-            sigma_length_mm: s[measure::LENGTH],
-            sigma_width_mm: s[measure::WIDTH],
-            sigma_height_mm: s[measure::HEIGHT],
-            belt_speed_mm_per_s: p[measure::SCALE] * travel_mm / elapsed_s.max(1e-9),
-            shape,
-            flags,
-            not_measured: None,
-            may_be_used: false,
-            belt_travel_mm: reference.at.travel_mm,
-            by_encoder: self.by_encoder(),
-        };
-        let sigma_max_mm = self.site.config.measure.sigma_max_mm;
-        record.flags.set(Flags::MERGED, track.was_merged());
-        record.flags.set(Flags::CLIPPED, self.reaches_out(p));
-        record.flags.set(Flags::HEIGHT_UNCERTAIN, record.sigma_height_mm > sigma_max_mm);
-        let footprint_sigma_mm = record.sigma_length_mm.max(record.sigma_width_mm);
-        record.flags.set(Flags::FOOTPRINT_UNCERTAIN, footprint_sigma_mm > sigma_max_mm);
-        record.flags.set(Flags::SPEED_ASSUMED, travel_sigma > SPEED_SIGMA_MAX);
-        record.flags.set(Flags::TOO_TALL, record.height_mm > self.site.height_max_mm);
-        record.flags.set(Flags::SILHOUETTE_ONLY, !measured.has_edges);
-        record.flags.set(Flags::HEIGHT_DISPUTED, measured.disputed);
-        // A standard deviation above the limit is a flag too.
-        record.may_be_used = record.flags.is_empty();
-        record
-    }
-
     /// Whether nothing of a parcel was in the zone.
     fn passed_beside(&self, slot: usize) -> bool {
         let beside = |y_mm: &[f64]| {
@@ -521,13 +458,6 @@ impl Pipeline {
             Some(outline) => beside(&outline.base.map(|v| v.over_belt.y)),
             None => beside(&[self.image_on_belt(slot).y]),
         }
-    }
-
-    /// Whether a cuboid reaches over the side of the zone, where nothing of it is used.
-    fn reaches_out(&self, params: &measure::Params) -> bool {
-        let outline = measure::Outline::new(&self.site.view, params, 0.0);
-        let zone = &self.zone;
-        outline.base.iter().any(|v| !(zone.y_min_mm..=zone.y_max_mm).contains(&v.over_belt.y))
     }
 
     /// Frames at which a parcel, by slot, passed the middle of the zone: where its record holds.

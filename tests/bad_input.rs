@@ -72,6 +72,23 @@ fn a_wrong_unit_is_recognised() {
 }
 
 #[test]
+fn what_a_plc_has_to_write_needs_one_that_may() {
+    for (name, table, key) in [
+        ("writes_queue", "[plc]\nqueue = true", "plc.queue"),
+        ("writes_heartbeat", "[plc]\nheartbeat_timeout_s = 2.0", "plc.heartbeat_timeout_s"),
+        ("writes_counts", "[encoder]\nmm_per_count = 0.05", "encoder.mm_per_count"),
+    ] {
+        let words = [key, "nobody may", "modbus.write_allow", "can.interface", "remedy"];
+        check_refused(name, "[belt]", &format!("{table}\n[belt]"), &words);
+        for who in ["[modbus]\nwrite_allow = [\"192.168.1.10\"]", "[can]\ninterface = \"can0\""] {
+            let config = site_with(name, "[belt]", &format!("{table}\n{who}\n[belt]"));
+            let output = run(beltgauge().arg("check").arg("--config").arg(config));
+            assert_eq!(output.status.code(), Some(0), "{who}: {output:?}");
+        }
+    }
+}
+
+#[test]
 fn a_zone_outside_the_view_names_the_corner_and_what_is_seen() {
     let words = ["zone", "900", "outside the camera's view", "320 x 240", "reach x", "remedy"];
     check_refused("outside", "x_max_mm = 300", "x_max_mm = 900", &words);

@@ -26,6 +26,16 @@ struct Camera {
 
 impl Camera {
     fn start(last: u8, url: &str, description: Vec<u8>) -> Self {
+        Self::pleading(last, url, description, |_| false)
+    }
+
+    /// One that answers requests of which `pleads` holds with nothing but pleas for more time.
+    fn pleading(
+        last: u8,
+        url: &str,
+        description: Vec<u8>,
+        pleads: impl Fn(&[u8]) -> bool + Send + 'static,
+    ) -> Self {
         let address = Ipv4Addr::new(127, 0, 9, last);
         let socket = UdpSocket::bind((address, 3956)).expect("this test's own address");
         socket.set_read_timeout(Some(Duration::from_millis(20))).expect("a socket");
@@ -36,8 +46,16 @@ impl Camera {
             memory[0x200..][..url.len()].copy_from_slice(&url);
             memory[DESCRIPTION_AT..][..description.len()].copy_from_slice(&description);
             let mut packet = [0; 2048];
+            let mut waiting = None;
             while !stopped.load(Ordering::Relaxed) {
+                if let Some((request, from)) = waiting {
+                    let _ = socket.send_to(&plea(request), from);
+                }
                 let Ok((length, from)) = socket.recv_from(&mut packet) else { continue };
+                if pleads(&packet[..length]) {
+                    waiting = Some(([packet[6], packet[7]], from));
+                    continue;
+                }
                 if let Some(answer) = answer(&mut memory, &packet[..length], address) {
                     socket.send_to(&answer, from).expect("sent");
                 }
@@ -71,6 +89,12 @@ impl Drop for Camera {
             thread.join().expect("the camera's thread");
         }
     }
+}
+
+/// PENDING_ACK: the answer will take ten seconds more.
+fn plea([high, low]: [u8; 2]) -> [u8; 12] {
+    let [most, least] = 10_000u16.to_be_bytes();
+    [0, 0, 0, 0x89, 0, 4, high, low, 0, 0, most, least]
 }
 
 /// Discovery, READREG, WRITEREG, READMEM, WRITEMEM.
@@ -120,6 +144,36 @@ fn a_well_meaning_description_is_understood_up_to_what_it_lacks() {
     let nodes = r#"<Integer Name="Width"><Value>512</Value></Integer>"#;
     let error = Camera::serving(1, described(nodes)).open();
     assert!(error.contains("does not take Height = 384"), "{error}");
+}
+
+/// Whether a request reads or writes this register, or memory from there on.
+fn is_of(packet: &[u8], commands: [u16; 2], register: u32) -> bool {
+    packet.get(2..4).is_some_and(|c| commands.map(u16::to_be_bytes).iter().any(|k| k == c))
+        && packet.get(8..12) == Some(&register.to_be_bytes()[..])
+}
+
+#[test]
+fn a_camera_that_pleads_for_more_time_for_ever_is_given_up_within_seconds() {
+    let nodes = r#"<Integer Name="Width"><pValue>W</pValue></Integer>
+<IntReg Name="W"><Address>0x5000</Address><Length>4</Length><AccessMode>RW</AccessMode>
+<pPort>Device</pPort><Sign>Unsigned</Sign><Endianess>BigEndian</Endianess></IntReg>"#;
+    let cases: [(u8, u32, [u16; 2], &str); 3] = [
+        (11, 0x0a00, [0x82, 0x86], "cannot control the camera: control"),
+        (12, 0x0200, [0x80, 0x84], "the camera is lost: 512 bytes at register 0x200"),
+        (13, 0x5000, [0x82, 0x86], "the camera is lost: writing 4 bytes at register 0x5000"),
+    ];
+    for (last, register, commands, expected) in cases {
+        let description = described(nodes);
+        let url = format!("Local:///a.xml;{DESCRIPTION_AT:x};{:x}", description.len());
+        let camera =
+            Camera::pleading(last, &url, description, move |p| is_of(p, commands, register));
+        let began = Instant::now();
+        let error = camera.open();
+        assert!(error.contains(expected), "{error}");
+        assert!(error.contains(&camera.address.to_string()), "which camera: {error}");
+        // Discovery, one deadline of 3 s, a child process; then nothing more is asked.
+        assert!(began.elapsed() < Duration::from_secs(8), "{:?}", began.elapsed());
+    }
 }
 
 #[test]

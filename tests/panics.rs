@@ -75,11 +75,11 @@ fn an_appliance_that_panics() {
     unreachable!("it ended in order: {ended:?}");
 }
 
-#[test]
-fn a_panic_in_any_thread_ends_the_process_within_a_second() {
+/// Panic so many times in each place.
+fn panic_everywhere(times: u32) {
     let this = std::env::current_exe().expect("a path");
     for place in ["capture", "main", "any other"] {
-        for run in 0..4 {
+        for run in 0..times {
             let mut process = Command::new(&this)
                 .args(["--exact", "an_appliance_that_panics", "--ignored", "--nocapture"])
                 .env(PLACE, place)
@@ -100,4 +100,15 @@ fn a_panic_in_any_thread_ends_the_process_within_a_second() {
             assert!(began.elapsed() < GONE_WITHIN, "{place}, run {run}: {:?}", began.elapsed());
         }
     }
+}
+
+#[test]
+fn a_panic_in_any_thread_ends_the_process_within_a_second() {
+    panic_everywhere(4);
+}
+
+#[test]
+#[ignore = "a minute or more"]
+fn a_hundred_panics_end_the_process_within_a_second_each() {
+    panic_everywhere(34);
 }

@@ -109,6 +109,56 @@ fn without_a_configuration_it_ends_with_the_remedy() {
     assert!(text.contains("current/beltgauge.toml") && text.contains("remedy"), "{text}");
 }
 
+/// What a thread of a process may do: lines of its status, by their names.
+fn rights(status: &str) -> Vec<(&str, Vec<&str>)> {
+    let names = ["Uid", "Gid", "Groups", "CapInh", "CapPrm", "CapEff", "CapAmb", "NoNewPrivs"];
+    let lines = status.lines().filter_map(|line| line.split_once(':'));
+    let wanted = lines.filter(|(name, _)| names.contains(name));
+    wanted.map(|(name, values)| (name, values.split_whitespace().collect())).collect()
+}
+
+#[test]
+fn every_thread_has_given_up_root() {
+    if !rustix::process::geteuid().is_root() {
+        eprintln!("skipped: only root has something to give up");
+        return;
+    }
+    let folder = scratch("run-user");
+    fs::set_permissions(&folder, std::os::unix::fs::PermissionsExt::from_mode(0o777))
+        .expect("ours");
+    let tables =
+        "device = \"/dev/video99\"\n[plc]\nstate_file = \"state\"\n[realtime]\nworkers = 2";
+    let run = start(&folder, tables, &["--user", "65534"]);
+    let log = wait_for(&folder.join("log"), &["no camera"]);
+    // The state file is written by a thread of its own, which has no more rights than the others.
+    wait_for(&folder.join("status.json"), &["\"camera_absent\":true"]);
+    assert!(folder.join("state").exists(), "{log}");
+    let tasks = Path::new("/proc").join(run.0.id().to_string()).join("task");
+    let threads: Vec<String> = fs::read_dir(&tasks)
+        .expect("it runs")
+        .map(|task| fs::read_to_string(task.expect("a thread").path().join("status")))
+        .collect::<Result<_, _>>()
+        .expect("threads that stay");
+    // Main, log, watchdog, capture, two of vision, PLC, journal.
+    assert!(threads.len() >= 8, "{}", threads.len());
+    // Bits of CAP_NET_BIND_SERVICE, CAP_NET_ADMIN, CAP_IPC_LOCK, CAP_SYS_NICE.
+    let kept = format!("{:016x}", 1u64 << 10 | 1 << 12 | 1 << 14 | 1 << 23);
+    let nothing = format!("{:016x}", 0);
+    let expected = [
+        ("Uid", vec!["65534"; 4]),
+        ("Gid", vec!["65534"; 4]),
+        ("Groups", vec![]),
+        ("CapInh", vec![nothing.as_str()]),
+        ("CapPrm", vec![kept.as_str()]),
+        ("CapEff", vec![kept.as_str()]),
+        ("CapAmb", vec![nothing.as_str()]),
+        ("NoNewPrivs", vec!["1"]),
+    ];
+    for thread in &threads {
+        assert_eq!(rights(thread), expected, "{thread}");
+    }
+}
+
 /// A pipe that nobody reads, and that is full.
 fn full_pipe() -> (std::io::PipeReader, std::io::PipeWriter) {
     use std::io::Write;

@@ -398,16 +398,40 @@ impl Config {
         count("modbus.idle_timeout_s", modbus.idle_timeout_s as usize, 1, 86_400)?;
         count("modbus.base_address", usize::from(modbus.base_address), 0, 60_000)?;
         can.check()?;
-        if plc.queue && can.interface.is_none() && modbus.write_allow.is_empty() {
-            return Err(Error::configuration(
-                "plc.queue = true, but nobody may acknowledge: modbus.write_allow is empty",
-            )
-            .allowed("addresses of the PLCs that write, as [\"192.168.1.10\"]")
-            .remedy("name the PLC in modbus.write_allow, or set plc.queue to false"));
-        }
         encoder.check()?;
+        check_writers(plc, modbus, can, encoder)?;
         import.public_key.as_deref().map_or(Ok(()), |key| public_key(key).map(drop))
     }
+}
+
+/// What a PLC has to write needs one that may.
+fn check_writers(plc: &Plc, modbus: &Modbus, can: &Can, encoder: &Encoder) -> Result<()> {
+    if can.interface.is_some() || !modbus.write_allow.is_empty() {
+        return Ok(());
+    }
+    let needed = [
+        (plc.queue, "plc.queue", "acknowledge", "set it to false"),
+        (
+            plc.heartbeat_timeout_s > 0.0,
+            "plc.heartbeat_timeout_s",
+            "write a heartbeat",
+            "set it to 0",
+        ),
+        (
+            encoder.mm_per_count.is_some(),
+            "encoder.mm_per_count",
+            "write the counts",
+            "leave it out",
+        ),
+    ];
+    let Some((_, key, what, without)) = needed.into_iter().find(|(set, ..)| *set) else {
+        return Ok(());
+    };
+    Err(Error::configuration(format!(
+        "{key} is set, but nobody may {what}: modbus.write_allow is empty and there is no CAN"
+    ))
+    .allowed("addresses of the PLCs that write, as [\"192.168.1.10\"]")
+    .remedy(format!("name the PLC in modbus.write_allow, or can.interface, or {without}")))
 }
 
 pub(super) fn range(key: &str, value: f64, min: f64, max: f64, unit: &str) -> Result<()> {

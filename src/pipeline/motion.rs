@@ -87,8 +87,11 @@ impl Witnesses {
         if let Some(encoder_mm) = encoder_step_mm.filter(|_| texture.measured) {
             self.ratio.add(encoder_mm, texture.step_mm);
         }
+        // What moves on a belt that stands, by the texture too, is moved by a hand.
         let stuck = encoder_step_mm.is_some_and(|encoder_mm| {
-            matches!(ride, Ride::Moves(ride) if encoder_mm.abs() < STILL * ride.abs() * dt_s)
+            let stands = |mm: f64, ride: f64| mm.abs() < STILL * ride.abs() * dt_s;
+            matches!(ride, Ride::Moves(ride)
+                if stands(encoder_mm, ride) && !(texture.measured && stands(texture.step_mm, ride)))
         });
         let disagreed = self.encoder_disagrees;
         self.encoder_disagrees = stuck || self.ratio.disagrees();
@@ -106,6 +109,13 @@ impl Witnesses {
     /// Before the belt is learned: by the encoder alone.
     pub fn encoder_alone(&mut self, step_mm: Option<f64>, dt_s: f64) {
         self.encoder_speed_mm_per_s = step_mm.filter(|_| dt_s > 0.0).map(|mm| mm / dt_s);
+    }
+
+    /// The encoder's step over a gap, if it is believed: nothing else is there to compare it with.
+    pub fn over_gap(&mut self, step_mm: Option<f64>, dt_s: f64) -> Option<f64> {
+        let believed = step_mm.filter(|_| !self.encoder_disagrees);
+        self.encoder_alone(believed, dt_s);
+        believed
     }
 
     /// By the encoder, if it is believed, in the last frame.

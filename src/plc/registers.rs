@@ -345,7 +345,7 @@ pub const STATUS_FIELDS: &[StatusField] = fields![
     [57, V1_2, "imports", U16, "", 1.0, "configurations that came on a stick; wraps", |s| f64::from(s.vision.import.count)],
     [58, V1_2, "import_result", U16, "", 1.0, "of the last: 0 there was none, 1 applied, 2 refused, 3 rolled back", |s| f64::from(s.vision.import.result)],
     [70, V2_0, "belt_seen", I32, "mm/s", 10.0, "belt speed that the pictures show, negative against +X; 0: none", |s| s.vision.belt.seen_mm_per_s.unwrap_or(0.0)],
-    [72, V2_0, "encoder_ratio", U16, "", 10000.0, "the encoder's travel over the belt's; 0: not known", |s| s.vision.belt.encoder_ratio.unwrap_or(0.0)],
+    [72, V2_0, "encoder_ratio", I16, "", 10000.0, "the encoder's travel over the belt's, negative when it counts the other way; 0: not known, or it stands", |s| s.vision.belt.encoder_ratio.unwrap_or(0.0)],
     [73, V2_0, "mm_per_count", I32, "mm", 1_000_000.0, "belt travel of a count, as configured or set by command 6; 0: no encoder", |s| s.mm_per_count.unwrap_or(0.0)],
     [75, V2_0, "mm_per_count_seen", I32, "mm", 1_000_000.0, "the same as the belt's texture shows it; 0: not known", |s| s.mm_per_count_seen().unwrap_or(0.0)],
 ];

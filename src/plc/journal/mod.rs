@@ -7,6 +7,7 @@
 //! A number is never given twice. It is on the disk before anybody sees it. When the disk fails, the
 //! belt goes on: numbers then come from another block, drawn at random, that no later run will reach
 //! by counting on from what the disk has. The fault is told, and the disk is tried again every second.
+//! A file that turns up then is taken up before it is written.
 //!
 //! Cost: one wait for the disk and two blocks written a parcel, and the same for an acknowledgment. A
 //! parcel a second, each acknowledged, is 63 million commits or 0.5 TB in blocks of 4 KiB a year.
@@ -57,6 +58,8 @@ pub struct Journal {
     given: u64,
     /// Numbers come from a block that the disk knows nothing of.
     elsewhere: bool,
+    /// Files that turned up after the start and were taken up.
+    met: u32,
     writer: Option<Writer>,
 }
 
@@ -64,11 +67,14 @@ impl Journal {
     /// Read what is there and count the boot. A disk that fails is told by [`Journal::keeping`] and is
     /// no error. A path that is no file, or a file that another process uses, is one.
     pub fn open(path: &Path) -> Result<Self> {
-        let (file, found) = match open_file(path)? {
-            Ok((file, found)) => (file, found),
+        let (file, found, read) = match open_file(path)? {
+            Ok((file, found)) => {
+                let read = Some(found.generation);
+                (file, found, read)
+            }
             Err(error) => {
                 tracing::error!(path = %path.display(), %error, "plc.state_file cannot be used");
-                (None, Found { damaged: true, ..Found::default() })
+                (None, Found { damaged: true, ..Found::default() }, None)
             }
         };
         let mut journal = Self {
@@ -77,16 +83,16 @@ impl Journal {
             noted: 1,
             given: 0,
             elsewhere: found.damaged,
+            met: 0,
             writer: None,
         };
-        let generation = found.generation;
         journal.take_up(found);
         journal.state.boots = journal.state.boots.wrapping_add(1);
         if journal.elsewhere {
-            journal.state.sequence = another_block(journal.state.sequence);
+            journal.state.sequence = another_block(journal.state.sequence, UNREAD_BLOCKS);
         }
         journal.writer = Some(
-            Writer::start(path, file, generation)
+            Writer::start(path, file, read)
                 .map_err(|e| Error::failure(format!("cannot start the journal's thread: {e}")))?,
         );
         journal.save();
@@ -114,6 +120,47 @@ impl Journal {
         }
     }
 
+    /// Take up a file that could not be read at the start and has turned up since. What this run has
+    /// given and was told goes on; numbers continue beyond both. Returns the parcels in it that
+    /// nobody has acknowledged, oldest first, once.
+    pub fn meet(&mut self) -> Option<Vec<ParcelRecord>> {
+        let found = self.writer.as_ref()?.met()?;
+        let (ours, our_records) = (self.state, std::mem::take(&mut self.records));
+        self.take_up(*found);
+        let theirs = self.state;
+        let unacknowledged = self.records.iter().filter(|r| is_after(r.seq, theirs.acknowledged));
+        let unacknowledged = unacknowledged.copied().collect();
+        for record in our_records {
+            if self.records.is_full() {
+                self.records.pop_front();
+            }
+            let _ = self.records.push_back(record); // invariant: there is room
+        }
+        let first_block = another_block(theirs.sequence, 1) & 0xffff_0000;
+        self.state = State {
+            boots: theirs.boots.wrapping_add(1),
+            sequence: if is_after(theirs.sequence, ours.sequence) {
+                // An acknowledgment is of this block or of what this run has given so far.
+                first_block | u32::from(ours.sequence as u16 ^ 0x8000)
+            } else {
+                ours.sequence
+            },
+            acknowledged: if ours.acknowledged == 0 {
+                theirs.acknowledged
+            } else {
+                ours.acknowledged
+            },
+            sent: if ours.sent == 0 { theirs.sent } else { ours.sent },
+            scale_interval_mm: ours.scale_interval_mm.or(theirs.scale_interval_mm),
+            mm_per_count: ours.mm_per_count.or(theirs.mm_per_count),
+            // A command of this run is newer.
+            ..if ours.ticket == 0 { theirs } else { ours }
+        };
+        self.met += 1;
+        self.noted += 1;
+        Some(unacknowledged)
+    }
+
     /// What is kept besides the parcels.
     pub fn state(&self) -> &State {
         &self.state
@@ -133,12 +180,11 @@ impl Journal {
         }
     }
 
-    /// Give a parcel its number. Once [`Journal::is_kept`] says so of what is returned with it, no
-    /// restart forgets it.
-    pub fn number(&mut self, mut record: ParcelRecord) -> (ParcelRecord, u64) {
-        let failing = self.keeping() == Keeping::Failing;
+    /// Give a parcel its number, the disk failing or not. Once [`Journal::is_kept`] says so of what is
+    /// returned with it, no restart forgets it.
+    pub fn number(&mut self, mut record: ParcelRecord, failing: bool) -> (ParcelRecord, u64) {
         if failing && !self.elsewhere {
-            self.state.sequence = another_block(self.state.sequence);
+            self.state.sequence = another_block(self.state.sequence, 1);
         }
         self.elsewhere = failing;
         // 0 is no parcel.
@@ -160,9 +206,15 @@ impl Journal {
         }
     }
 
-    /// Whether the disk has begun to fail since the last number was given.
-    pub fn began_to_fail(&self) -> bool {
-        !self.elsewhere && self.keeping() == Keeping::Failing
+    /// Whether the last number is of a block that the disk knows nothing of.
+    pub fn is_elsewhere(&self) -> bool {
+        self.elsewhere
+    }
+
+    /// Whether the disk fails at this moment. Another thread finds that out: whoever does several
+    /// things by it asks once.
+    pub fn is_failing(&self) -> bool {
+        self.keeping() == Keeping::Failing
     }
 
     /// Change the state. Returns a number for [`Journal::is_kept`].
@@ -188,7 +240,7 @@ impl Journal {
         if self.given < self.noted
             && let Some(writer) = &self.writer
         {
-            writer.give(&self.state, &self.records, self.noted);
+            writer.give(&self.state, &self.records, self.noted, self.met);
             self.given = self.noted;
         }
     }
@@ -200,7 +252,7 @@ impl Journal {
 
     /// Whether what was noted is as safe as it gets: on the disk, or the disk fails.
     pub fn is_kept(&self, noted: u64) -> bool {
-        self.is_on_disk(noted) || self.keeping() == Keeping::Failing
+        self.is_on_disk(noted) || self.is_failing()
     }
 }
 
@@ -215,12 +267,21 @@ impl Drop for Journal {
 /// Parcels that a commit may write before the state that counts them, and one.
 const AHEAD_MAX: u32 = QUEUE_PARCELS as u32 + 1;
 
-/// Another block of 2^16 numbers further on, drawn at random, half a turn away in its low word: an
-/// acknowledgment, which is a low word, is of one block or the other and never of both.
-fn another_block(sequence: u32) -> u32 {
+/// A run that could not read its file begins this many blocks on: it is beyond what a parcel a second
+/// has counted to in eight years, and within reach of [`is_after`].
+const UNREAD_BLOCKS: u32 = 0x1000;
+
+/// Another block of 2^16 numbers, at least `blocks` further on, drawn at random, half a turn away in
+/// its low word: an acknowledgment, which is a low word, is of one block or the other and never of both.
+fn another_block(sequence: u32, blocks: u32) -> u32 {
     let random = RandomState::new().hash_one(Instant::now()) as u32;
     // Less than half of all numbers on, so that what comes later is later.
-    sequence.wrapping_add((1 + random % 0x3fff) << 16) ^ 0x8000
+    sequence.wrapping_add((blocks + random % 0x3fff) << 16) ^ 0x8000
+}
+
+/// Whether sequence number `a` was given after `b`, numbers wrapping around.
+pub(super) fn is_after(a: u32, b: u32) -> bool {
+    a != b && a.wrapping_sub(b) < u32::MAX / 2
 }
 
 /// A file, if it may be written, and what it holds.

@@ -103,7 +103,7 @@ pub fn parse(bytes: &[u8]) -> Found {
     let slot = |at: usize| bytes.get(at..at + SLOT_BYTES).unwrap_or_default();
     for i in 0..STATES {
         let Some((generation, payload)) = open(slot(i * STATE_STRIDE), STATE) else { continue };
-        let newer = found.state.is_none() || generation.wrapping_sub(found.generation) < 1 << 31;
+        let newer = found.state.is_none() || is_newer(generation, found.generation);
         if let Ok((state, _)) = postcard::take_from_bytes(payload)
             && newer
         {
@@ -121,6 +121,11 @@ pub fn parse(bytes: &[u8]) -> Found {
     }
     found.damaged = found.state.is_none() && bytes.iter().any(|byte| *byte != 0);
     found
+}
+
+/// Whether a generation came after another, both wrapping around.
+pub fn is_newer(generation: u32, than: u32) -> bool {
+    generation != than && generation.wrapping_sub(than) < 1 << 31
 }
 
 /// The number and the payload of a slot that is whole.

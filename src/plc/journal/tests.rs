@@ -18,7 +18,7 @@ fn open(path: &Path) -> Journal {
 fn number(journal: &mut Journal, count: u32) -> u32 {
     let mut last = (record(0), 0);
     for i in 0..count {
-        last = journal.number(record(1000 + i));
+        last = journal.number(record(1000 + i), journal.is_failing());
     }
     journal.save();
     while !journal.is_kept(last.1) {
@@ -168,6 +168,74 @@ fn a_disk_that_is_not_there_is_told_and_numbers_never_meet() {
     assert_eq!(given[3], given[0] + 3);
 }
 
+/// A folder that is there, or is not.
+fn mount(folder: &Path, mounted: bool) {
+    let (there, away) = (folder.join("mounted"), folder.join("away"));
+    let (from, to) = if mounted { (away, there) } else { (there, away) };
+    std::fs::rename(from, to).expect("renamed");
+}
+
+#[test]
+fn a_file_that_turns_up_after_the_start_is_taken_up_and_not_overwritten() {
+    let folder = folder("turns-up");
+    std::fs::create_dir(folder.join("mounted")).expect("writable");
+    let path = folder.join("mounted/state");
+    let mut journal = open(&path);
+    // More commits than the run that does not see them makes.
+    for _ in 0..40 {
+        number(&mut journal, 1);
+    }
+    journal.change(|state| (state.acknowledged, state.ticket, state.stopped) = (38, 9, true));
+    kill(journal);
+    mount(&folder, false);
+    let mut journal = open(&path);
+    assert!(journal.meet().is_none());
+    let given = [number(&mut journal, 1), number(&mut journal, 1)];
+    mount(&folder, true);
+    let mut met = None;
+    let begun = Instant::now();
+    while met.is_none() {
+        assert!(begun.elapsed() < Duration::from_secs(20), "nothing turned up");
+        std::thread::sleep(Duration::from_millis(2));
+        met = journal.meet();
+    }
+    assert!(met.expect("met").iter().map(|r| r.seq).eq([39, 40]), "not acknowledged yet");
+    assert!(journal.meet().is_none(), "once");
+    assert_eq!(journal.keeping(), Keeping::Failing, "nothing is written before");
+    journal.save();
+    until("written again", || journal.keeping() == Keeping::Disk);
+    let next = number(&mut journal, 1);
+    assert_eq!(next, given[1] + 1);
+    kill(journal);
+    let journal = open(&path);
+    let state = journal.state();
+    assert_eq!((state.boots, state.sequence, state.acknowledged), (3, next, 38));
+    assert!(state.ticket == 9 && state.stopped);
+    let kept: Vec<u32> = journal.records().iter().map(|r| r.seq).collect();
+    assert_eq!(kept[kept.len() - 5..], [39, 40, given[0], given[1], next]);
+}
+
+#[test]
+fn a_file_that_turns_up_with_later_numbers_is_gone_beyond() {
+    let folder = folder("later");
+    std::fs::create_dir(folder.join("mounted")).expect("writable");
+    let path = folder.join("mounted/state");
+    let mut journal = open(&path);
+    journal.state.sequence = 0x6000_0000;
+    let last = number(&mut journal, 1);
+    kill(journal);
+    mount(&folder, false);
+    let mut journal = open(&path);
+    let given = number(&mut journal, 1);
+    mount(&folder, true);
+    until("turned up", || journal.writer.as_ref().expect("a disk").has_met());
+    journal.meet().expect("turned up");
+    let next = number(&mut journal, 1);
+    assert!(is_after(given, 0) && is_after(last, given) && is_after(next, last), "{next:#x}");
+    // An acknowledgment, a low word, is of one or the other.
+    assert_eq!(next as u16, (given as u16 ^ 0x8000).wrapping_add(1));
+}
+
 #[test]
 fn numbers_given_while_the_disk_fails_are_not_given_after_a_restart() {
     let folder = folder("fails");
@@ -178,10 +246,11 @@ fn numbers_given_while_the_disk_fails_are_not_given_after_a_restart() {
     let kept = std::fs::read(&path).expect("readable");
     let writer = journal.writer.take().expect("on a disk");
     drop(writer);
-    journal.writer = Some(Writer::start(&folder.join("gone/state"), None, 9).expect("starts"));
-    assert!(journal.began_to_fail());
+    journal.writer =
+        Some(Writer::start(&folder.join("gone/state"), None, Some(9)).expect("starts"));
+    assert!(journal.is_failing() && !journal.is_elsewhere());
     let elsewhere: Vec<u32> = (0..100).map(|_| number(&mut journal, 1)).collect();
-    assert!(!journal.began_to_fail(), "once");
+    assert!(journal.is_elsewhere());
     assert_eq!(elsewhere[0] as u16 ^ 0x8000, 4, "the low word is half a turn away");
     kill(journal);
     std::fs::write(&path, kept).expect("writable");
@@ -190,6 +259,17 @@ fn numbers_given_while_the_disk_fails_are_not_given_after_a_restart() {
         let given = number(&mut journal, 1);
         assert!(!elsewhere.contains(&given), "{given}");
     }
+}
+
+#[test]
+fn a_batch_is_of_one_block_whatever_the_disk_does_meanwhile() {
+    let path = folder("batch").join("state");
+    let mut journal = open(&path);
+    number(&mut journal, 3);
+    // It fails when it is asked about, and no more when the batch is numbered.
+    let failing = true;
+    let batch = [4, 5, 6].map(|seq| journal.number(record(seq), failing).0.seq);
+    assert!(batch[0] > 0xffff && batch[2] == batch[0] + 2, "{batch:?}");
 }
 
 #[test]

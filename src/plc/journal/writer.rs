@@ -1,6 +1,6 @@
 //! The thread that waits for the disk, so that nobody else does.
 
-use super::slots::{self, State};
+use super::slots::{self, Found, State};
 use super::{Records, open_for_writing, prepare};
 use std::fs::File;
 use std::path::{Path, PathBuf};
@@ -20,6 +20,8 @@ struct Snapshot {
     state: State,
     records: Records,
     noted: u64,
+    /// Files whose contents are in it: see [`Writer::met`].
+    met: u32,
 }
 
 /// What the thread and the journal share.
@@ -28,6 +30,8 @@ struct Shared {
     /// The newest snapshot that was not taken yet, and whether the thread is to end.
     given: Mutex<(Option<Box<Snapshot>>, bool)>,
     wake: Condvar,
+    /// What a file holds that was not there, or was another one, when the journal was opened.
+    met: Mutex<Option<Box<Found>>>,
     /// How much of what was noted is on the disk.
     saved: AtomicU64,
     /// The last commit failed.
@@ -45,17 +49,24 @@ pub(super) struct Writer {
 }
 
 impl Writer {
-    /// `file`: none when it cannot be written at present.
-    pub(super) fn start(path: &Path, file: Option<File>, generation: u32) -> std::io::Result<Self> {
+    /// `file`: none when it cannot be written at present. `read`: the generation of what the journal
+    /// has read of it; none when it could not be read.
+    pub(super) fn start(
+        path: &Path,
+        file: Option<File>,
+        read: Option<u32>,
+    ) -> std::io::Result<Self> {
         let shared = Arc::new(Shared {
             given: Mutex::default(),
             wake: Condvar::new(),
+            met: Mutex::default(),
             saved: AtomicU64::new(0),
             failed: AtomicBool::new(file.is_none()),
             began_ms: AtomicU64::new(0),
             start: Instant::now(),
         });
-        let disk = Disk { path: path.to_owned(), file, generation, written: Records::new() };
+        let disk =
+            Disk { path: path.to_owned(), file, generation: read, written: Records::new(), met: 0 };
         let theirs = Arc::clone(&shared);
         let thread = std::thread::Builder::new()
             .name("journal".into())
@@ -63,11 +74,22 @@ impl Writer {
         Ok(Self { shared, thread: Some(thread) })
     }
 
-    pub(super) fn give(&self, state: &State, records: &Records, noted: u64) {
-        let snapshot = Snapshot { state: *state, records: records.clone(), noted };
+    pub(super) fn give(&self, state: &State, records: &Records, noted: u64, met: u32) {
+        let snapshot = Snapshot { state: *state, records: records.clone(), noted, met };
         let mut given = self.shared.given.lock().unwrap_or_else(PoisonError::into_inner);
         given.0 = Some(Box::new(snapshot));
         self.shared.wake.notify_one();
+    }
+
+    /// What has turned up on the disk and must not be lost: once. Nothing is written until a snapshot
+    /// comes that counts it.
+    pub(super) fn met(&self) -> Option<Box<Found>> {
+        self.shared.met.lock().unwrap_or_else(PoisonError::into_inner).take()
+    }
+
+    #[cfg(test)]
+    pub(super) fn has_met(&self) -> bool {
+        self.shared.met.lock().unwrap_or_else(PoisonError::into_inner).is_some()
     }
 
     pub(super) fn saved(&self) -> u64 {
@@ -99,33 +121,60 @@ impl Drop for Writer {
 struct Disk {
     path: PathBuf,
     file: Option<File>,
-    generation: u32,
+    /// Of the newest state in the file, as far as it is known.
+    generation: Option<u32>,
     written: Records,
+    /// Files that turned up.
+    met: u32,
 }
 
 impl Disk {
-    fn write(&mut self, snapshot: &Snapshot) -> std::io::Result<()> {
-        let file = match &mut self.file {
+    /// Open the file again, or for the first time. What it holds that this run did not write, nor
+    /// read at its start, goes to the journal.
+    fn open(&mut self, shared: &Shared) -> std::io::Result<File> {
+        let file = open_for_writing(&self.path)?;
+        // Whoever has taken it meanwhile keeps it.
+        file.try_lock()?;
+        let (file, found) = prepare(&self.path, file)?;
+        let file = file.ok_or(std::io::ErrorKind::NotFound)?;
+        let is_newer = |known: u32| slots::is_newer(found.generation, known);
+        if found.state.is_some() && self.generation.is_none_or(is_newer) {
+            tracing::warn!(
+                path = %self.path.display(),
+                "plc.state_file has turned up: what it holds is taken up"
+            );
+            self.met += 1;
+            self.generation = Some(found.generation);
+            *shared.met.lock().unwrap_or_else(PoisonError::into_inner) = Some(Box::new(found));
+        } else if found.state.is_some() {
+            // The last commit may not have come to be: the next one takes its slot.
+            self.generation = Some(found.generation);
+        }
+        Ok(file)
+    }
+
+    fn write(&mut self, snapshot: &Snapshot, shared: &Shared) -> std::io::Result<()> {
+        let file = match self.file.take() {
             Some(file) => file,
-            none => {
-                let file = open_for_writing(&self.path)?;
-                // Whoever has taken it meanwhile keeps it.
-                file.try_lock()?;
-                none.insert(prepare(&self.path, file)?.0.ok_or(std::io::ErrorKind::NotFound)?)
-            }
+            None => self.open(shared)?,
         };
+        let file = self.file.insert(file);
+        if snapshot.met != self.met {
+            return Err(std::io::Error::other("it holds what is to be taken up first"));
+        }
         let is_new = |r: &&crate::event::ParcelRecord| !self.written.iter().any(|w| w.seq == r.seq);
-        let generation = self.generation.wrapping_add(1);
+        let generation = self.generation.unwrap_or(0).wrapping_add(1);
         let committed = slots::commit(
             file,
             snapshot.records.iter().filter(is_new),
             &snapshot.state,
             generation,
         );
+        // Also when it failed: it may be there all the same.
+        self.generation = Some(generation);
         match committed {
             Ok(()) => {
                 self.written = snapshot.records.clone();
-                self.generation = generation;
                 Ok(())
             }
             Err(error) => {
@@ -159,7 +208,7 @@ fn write_all(shared: &Shared, mut disk: Disk) {
         let Some(snapshot) = newest.or(unsaved.take()) else { return };
         let now_ms = shared.start.elapsed().as_millis() as u64;
         shared.began_ms.store(now_ms.max(1), Ordering::Release);
-        let written = disk.write(&snapshot);
+        let written = disk.write(&snapshot, shared);
         shared.began_ms.store(0, Ordering::Release);
         let failed_before = shared.failed.swap(written.is_err(), Ordering::AcqRel);
         match written {

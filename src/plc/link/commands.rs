@@ -2,7 +2,7 @@
 
 use super::{Decided, Link, REQUESTS_MAX};
 use crate::plc::command::{Outcome, Request, Sender};
-use crate::plc::journal::Override;
+use crate::plc::journal::{Override, is_after};
 use crate::plc::registers::{COMMAND, COMMAND_COUNT, COMMAND_FIELDS, CommandBlock};
 use crate::plc::table::join;
 use std::time::Instant;
@@ -123,8 +123,9 @@ impl Link {
             return Answer { noted, ticket, outcome };
         }
         if self.decided.is_full() {
-            // The disk hangs. `ticket_done` stays what it was: the sender repeats.
-            return Answer { noted: 0, ticket: last.ticket, outcome: Outcome::Busy as u16 };
+            // The disk hangs. `ticket_done` stays what it was, and nothing is noted: the same ticket may
+            // come again.
+            return Answer { noted: 0, ticket, outcome: Outcome::Busy as u16 };
         }
         let (outcome, request) =
             if ticket == 0 { (Outcome::None, None) } else { self.decide(command, argument) };
@@ -211,7 +212,12 @@ impl Link {
         }
         // A repetition of one that is on its way is answered when that is there.
         let Some(last) = last else { return self.acknowledgment };
-        self.acknowledgment = self.journal.change(|state| state.acknowledged = last.seq);
+        self.acknowledgment = self.journal.change(|state| {
+            // What has turned up with the state file waits in front of newer ones.
+            if is_after(last.seq, state.acknowledged) {
+                state.acknowledged = last.seq;
+            }
+        });
         self.acknowledgment
     }
 }

@@ -11,7 +11,7 @@ pub use commands::{Answer, Refusal};
 use crate::config::{Plc as Settings, WordOrder};
 use crate::event::ParcelRecord;
 use crate::plc::command::{Outcome, Request};
-use crate::plc::journal::{Journal, Keeping, Override, State};
+use crate::plc::journal::{Journal, Keeping, Override, State, is_after};
 use crate::plc::present::presented;
 use crate::plc::registers::{
     CanStatus, CommandBlock, RING_PARCELS, RegisterImage, Status, VisionStatus,
@@ -166,6 +166,37 @@ impl Link {
         }
     }
 
+    /// A state file that could not be read at the start has turned up: what it keeps holds again, but
+    /// for what this run was told since. What waited in it to be acknowledged goes first.
+    fn meet(&mut self) {
+        // What holds again may be two requests.
+        if self.requests.len() + self.decided.len() + 2 > REQUESTS_MAX {
+            return;
+        }
+        let Some(unacknowledged) = self.journal.meet() else { return };
+        let state = *self.journal.state();
+        if self.settings.queue {
+            for record in unacknowledged.into_iter().rev() {
+                let no_room = self.queue.push_front(record).is_err();
+                self.status.queue_overflows += u64::from(no_room);
+            }
+        }
+        if state.stopped != self.status.stopped {
+            let _ = self.requests.push_back(Request::Report(!state.stopped)); // invariant: there is room
+        }
+        let mm_per_count =
+            self.configured_mm_per_count.map(|mm| Override::of(state.mm_per_count, mm));
+        if let Some(set) = mm_per_count.filter(|_| mm_per_count != self.status.mm_per_count) {
+            let _ = self.requests.push_back(Request::MmPerCount(set)); // invariant: there is room
+            self.status.mm_per_count = mm_per_count;
+        }
+        self.status.boots = state.boots;
+        if self.decided.is_empty() {
+            (self.status.ticket, self.status.outcome) = (state.ticket, state.outcome);
+        }
+        self.show_settings();
+    }
+
     /// A parcel has left the zone, the belt being at `travel_mm`.
     pub fn record(&mut self, record: ParcelRecord, travel_mm: f64) {
         // At once, or when the belt is known to be there.
@@ -188,6 +219,7 @@ impl Link {
         encoder_timeout: Option<Duration>,
         now: Instant,
     ) {
+        self.meet();
         while self.waiting.front().is_some_and(|(_, due_mm)| vision.belt_travel_mm >= *due_mm)
             && self.number_first()
         {}
@@ -237,12 +269,13 @@ impl Link {
     /// never given to another. False when that has to wait: the disk has not answered for many
     /// parcels, and will soon count as failing.
     fn number_first(&mut self) -> bool {
-        self.publish_kept();
+        let failing = self.journal.is_failing();
+        self.publish(failing);
         if self.numbered.is_full() {
             return false;
         }
         let Some((record, _)) = self.waiting.pop_front() else { return false };
-        let numbered = self.journal.number(presented(record, &self.settings));
+        let numbered = self.journal.number(presented(record, &self.settings), failing);
         if !self.settings.queue {
             // A queue that is turned on later begins with what comes then.
             self.journal.taken(numbered.0.seq);
@@ -252,31 +285,36 @@ impl Link {
         true
     }
 
+    fn publish_kept(&mut self) {
+        self.publish(self.journal.is_failing());
+    }
+
     /// Publish what the disk has. When it fails the belt goes on: what was numbered and not seen by
     /// anybody is numbered again, beyond what the disk may have.
-    fn publish_kept(&mut self) {
+    fn publish(&mut self, failing: bool) {
         while self.numbered.front().is_some_and(|(_, noted)| self.journal.is_on_disk(*noted)) {
             self.publish_first();
         }
-        if self.journal.began_to_fail() && !self.numbered.is_empty() {
+        if failing && !self.journal.is_elsewhere() && !self.numbered.is_empty() {
             self.journal.take_back(self.numbered.len());
             for (record, noted) in &mut self.numbered {
-                (*record, *noted) = self.journal.number(*record);
+                (*record, *noted) = self.journal.number(*record, failing);
             }
         }
-        while self.numbered.front().is_some_and(|(_, noted)| self.journal.is_kept(*noted)) {
+        while failing && !self.numbered.is_empty() {
             self.publish_first();
         }
-        while self.decided.front().is_some_and(|decided| self.journal.is_kept(decided.noted)) {
-            if let Some(decided) = self.decided.pop_front() {
-                self.carry_out(&decided);
-            }
+        while let Some(decided) = self.decided.front()
+            && (failing || self.journal.is_on_disk(decided.noted))
+            && let Some(decided) = self.decided.pop_front()
+        {
+            self.carry_out(&decided);
         }
     }
 
     fn publish_first(&mut self) {
         if let Some((record, _)) = self.numbered.pop_front() {
-            self.publish(record);
+            self.show_parcel(record);
         }
     }
 
@@ -289,15 +327,20 @@ impl Link {
             }
             let _ = self.requests.push_back(request); // invariant: room was asked for
         }
-        let state = self.journal.state();
         (self.status.ticket, self.status.outcome) = (decided.ticket, decided.outcome as u16);
+        self.show_settings();
+    }
+
+    /// What commands have set.
+    fn show_settings(&mut self) {
+        let state = self.journal.state();
         self.status.stopped = state.stopped;
         let configured_mm = self.configured_scale_interval_mm;
         self.settings.scale_interval_mm = Override::of(state.scale_interval_mm, configured_mm);
         self.status.scale_interval_mm = self.settings.scale_interval_mm;
     }
 
-    fn publish(&mut self, record: ParcelRecord) {
+    fn show_parcel(&mut self, record: ParcelRecord) {
         self.status.sequence = record.seq;
         self.image.publish(&record);
         if self.settings.queue {
@@ -357,11 +400,6 @@ impl Link {
     pub fn next_request(&mut self) -> Option<Request> {
         self.requests.pop_front()
     }
-}
-
-/// Whether sequence number `a` was given after `b`, numbers wrapping around.
-fn is_after(a: u32, b: u32) -> bool {
-    a != b && a.wrapping_sub(b) < u32::MAX / 2
 }
 
 #[cfg(test)]

@@ -285,6 +285,12 @@ fn the_encoder_s_scale_is_corrected_by_the_belt_and_stays_so() {
     link.update(&vision, &CanStatus::default(), None, Instant::now());
     assert_eq!(link.status().fault_bits() & 128, 128);
     assert_eq!(link.read(72, 5), Some(&[12500, 0, 50000, 0, 40000][..]));
+    // One that counts the other way is told as such, and no scale for command 6 to correct.
+    vision.belt.encoder_ratio = Some(-1.0);
+    link.update(&vision, &CanStatus::default(), None, Instant::now());
+    assert_eq!(link.read(72, 1), Some(&[(-10_000i16) as u16][..]));
+    vision.belt.encoder_ratio = Some(1.25);
+    link.update(&vision, &CanStatus::default(), None, Instant::now());
     let noted = link.command(2, 6, 0, SENDER).noted;
     wait_until_kept(&mut link, noted);
     assert_eq!(link.next_request(), Some(Request::MmPerCount(0.04)));
@@ -300,4 +306,64 @@ fn the_encoder_s_scale_is_corrected_by_the_belt_and_stays_so() {
     let mut link = on_disk(&path, Settings::default()).with_encoder(Some(0.041));
     assert_eq!(link.next_request(), None);
     let _ = std::fs::remove_file(&path);
+}
+
+#[test]
+fn what_turns_up_with_the_state_file_waits_to_be_acknowledged_and_holds_again() {
+    let folder = std::env::temp_dir().join(format!("beltgauge-met-{}", std::process::id()));
+    let _ = std::fs::remove_dir_all(&folder);
+    std::fs::create_dir_all(folder.join("mounted")).expect("writable");
+    let path = folder.join("mounted/state");
+    let start = || {
+        let journal = Journal::open(&path).expect("ours");
+        Link::new(queueing(), WordOrder::HighFirst, false, journal, Instant::now())
+    };
+    let update = |link: &mut Link| {
+        link.update(&VisionStatus::default(), &CanStatus::default(), None, Instant::now());
+    };
+    // Whatever the disk waits for.
+    let until = |link: &mut Link, holds: &dyn Fn(&Link) -> bool| {
+        let begun = Instant::now();
+        while !holds(link) {
+            assert!(begun.elapsed().as_secs() < 20, "{:?}", link.status());
+            std::thread::sleep(Duration::from_millis(2));
+            update(link);
+        }
+    };
+    let mut link = start();
+    publish(&mut link, 2);
+    until(&mut link, &|link| link.status().queued == 2);
+    link.command(9, 4, 0, SENDER);
+    until(&mut link, &|link| link.status().stopped);
+    drop(link);
+    std::fs::rename(folder.join("mounted"), folder.join("away")).expect("renamed");
+    let mut link = start();
+    publish(&mut link, 1);
+    let new = sequence_at(&link, QUEUE_HEAD);
+    assert!(new > 0xffff && !link.status().stopped, "{new}");
+    std::fs::rename(folder.join("away"), folder.join("mounted")).expect("renamed");
+    until(&mut link, &|link| link.status().keeping == Keeping::Disk);
+    let status = link.status();
+    assert_eq!((status.boots, status.ticket, status.stopped), (2, 9, true));
+    assert_eq!(link.next_request(), Some(Request::Report(false)));
+    assert_eq!(sequence_at(&link, QUEUE_HEAD), 1);
+    for (acknowledged, head) in [(1, 2), (2, new), (new as u16, 0)] {
+        link.write(COMMAND + 1, &[acknowledged], SENDER, Instant::now()).expect("known");
+        assert_eq!(sequence_at(&link, QUEUE_HEAD), head, "after {acknowledged}");
+    }
+    std::fs::remove_dir_all(&folder).expect("removed");
+}
+
+#[test]
+fn a_sender_that_finds_the_disk_hanging_is_told_so_of_its_own_ticket() {
+    let mut link = link(Settings::default());
+    let (ticket, outcome) = (6, Outcome::Done);
+    while !link.decided.is_full() {
+        let _ = link.decided.push_back(Decided { noted: 0, ticket, outcome, request: None });
+    }
+    let answer = link.command(77, 3, 0, SENDER);
+    assert_eq!((answer.ticket, answer.outcome), (77, Outcome::Busy as u16));
+    // Nothing was noted of it: the same ticket may come again.
+    link.publish_kept();
+    assert_eq!(link.command(77, 3, 0, SENDER).outcome, Outcome::Done as u16);
 }

@@ -63,6 +63,8 @@ impl Vision<'_> {
                 if self.shared.source_ended.load(Ordering::Acquire) && self.ready.is_empty() {
                     return Ok(());
                 }
+                // A gap in the frames is none in the encoder's counts.
+                self.take_counts();
                 std::thread::park_timeout(PARK);
                 continue;
             };
@@ -104,14 +106,19 @@ impl Vision<'_> {
         }
     }
 
+    fn take_counts(&mut self) {
+        let Some((encoder, start)) = &mut self.encoder else { return };
+        while let Some((count, at)) = self.counts.dequeue() {
+            encoder.count(count, at.saturating_duration_since(*start).as_secs_f64());
+        }
+    }
+
     /// Tell the pipeline where the belt was when a frame was exposed.
     fn read_encoder(&mut self, captured: Instant) {
+        self.take_counts();
         let Some((encoder, start)) = &mut self.encoder else { return };
-        let seconds = |at: Instant| at.saturating_duration_since(*start).as_secs_f64();
-        while let Some((count, at)) = self.counts.dequeue() {
-            encoder.count(count, seconds(at));
-        }
-        if let Some(position_mm) = encoder.position_mm(seconds(captured)) {
+        let captured_s = captured.saturating_duration_since(*start).as_secs_f64();
+        if let Some(position_mm) = encoder.position_mm(captured_s) {
             self.pipeline.encoder(position_mm);
         }
     }

@@ -74,8 +74,8 @@ impl Gige {
         format: PixelFormat,
         size_px: [usize; 2],
     ) -> Result<Self> {
-        let mut features = Features::of(control.registers())?;
-        set_features(&mut features, &control, settings, size_px)?;
+        let mut features =
+            described(&control, settings, size_px).map_err(|e| control.silence().unwrap_or(e))?;
         let network = |e: std::io::Error| failed("cannot open a socket for the pictures", e);
         // The address by which the camera reaches us is that by which we reach it.
         let towards = UdpSocket::bind((Ipv4Addr::UNSPECIFIED, 0)).map_err(network)?;
@@ -105,7 +105,7 @@ impl Gige {
         let image_bytes = format.row_bytes(width) * height;
         let datagram_bytes = (packet_bytes - HEADERS) as usize;
         let assembly = Assembly::new(image_bytes, datagram_bytes, size_px)?;
-        let started = features.start(control.registers())?;
+        let started = features.start(&control)?;
         started.map_err(|e| failed("cannot start the camera", e))?;
         let datagram = vec![0; packet_bytes as usize];
         let heard = Instant::now();
@@ -216,7 +216,7 @@ impl Driver for Gige {
 
 impl Drop for Gige {
     fn drop(&mut self) {
-        self.features.stop(self.control.registers());
+        self.features.stop(&self.control);
         // A camera that is gone does not hear it.
         let _ = self.control.write(stream_register(consts::STREAM_DESTINATION_PORT), 0);
     }
@@ -259,15 +259,16 @@ fn find(wanted: Option<&str>) -> Result<DeviceInfo> {
     }
 }
 
-fn set_features(
-    features: &mut Features,
+/// The camera's features, those of the configuration set.
+fn described(
     control: &Control,
     settings: &CameraTable,
     [width, height]: [usize; 2],
-) -> Result<()> {
+) -> Result<Features> {
+    let mut features = Features::of(control)?;
     // Outside: the child has ended; inside: the camera refuses.
     let mut set = |key: &str, name: &str, value: &str| -> Result<Result<()>> {
-        let set = features.set(control.registers(), name, value)?;
+        let set = features.set(control, name, value)?;
         Ok(set.map_err(|e| {
             Error::configuration(format!("{key}: the camera does not take {name} = {value}: {e}"))
                 .remedy("give what the camera's manual allows")
@@ -303,7 +304,7 @@ fn set_features(
         let text = value.as_str().map_or_else(|| value.to_string(), ToOwned::to_owned);
         set(&format!("camera.controls.{name}"), name, &text)??;
     }
-    Ok(())
+    Ok(features)
 }
 
 /// Tell the camera where to send its pictures, and in packets of which size; returns the size.

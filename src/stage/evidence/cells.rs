@@ -121,14 +121,11 @@ impl Cells {
             }
         }
         let values = &mut self.values[place * columns * rows..][..columns * rows];
-        for i in 0..columns * rows {
-            if !self.usable[i] {
-                continue;
-            }
-            let fine = self.log[i] - self.slow[i];
-            let still = &mut self.still[i];
+        let fine = self.log.iter().zip(&*self.slow).map(|(log, slow)| log - slow);
+        let cells = values.iter_mut().zip(&mut *self.still).zip(&*self.usable).zip(fine);
+        for (((value, still), _), fine) in cells.filter(|((_, usable), _)| **usable) {
             *still += (fine - *still).clamp(-STILL_STEP, STILL_STEP);
-            values[i] = ((fine - *still) * UNITS).round().clamp(-127.0, 127.0) as i8;
+            *value = ((fine - *still) * UNITS).round().clamp(-127.0, 127.0) as i8;
         }
     }
 
@@ -177,6 +174,6 @@ mod tests {
                 if inside { values[i - 2..=i + 2].iter().sum::<f32>() / 5.0 } else { values[i] };
             assert!((columns[2 * i] - mean).abs() < 1e-5, "{i}");
         }
-        assert!(columns.iter().skip(1).step_by(2).all(|&v| v == -1.0));
+        assert!(columns.iter().skip(1).step_by(2).all(|&v| (v + 1.0).abs() < 1e-6));
     }
 }

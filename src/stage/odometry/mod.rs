@@ -14,7 +14,10 @@
 //! Source: normalised cross-correlation; its peak by Lanczos interpolation, because a parabola
 //! through three shifts is off by 0.05 px, always towards the same side at the same speed.
 
+mod across;
 mod peaks;
+
+pub use across::Across;
 
 use peaks::{PEAK_HALF, PEAK_SHIFTS, Peaks, peak};
 
@@ -61,6 +64,13 @@ const STANDSTILL_GREY_MIN: f64 = 0.25;
 const STILL: f64 = 0.1;
 /// Silhouettes move at the belt's speed, or up to the magnification faster, with this margin.
 const RIDE_MARGIN: f64 = 0.1;
+
+/// A texture proves to be the belt's by moving as expected in so many frames ...
+const PROOF_FRAMES: u32 = 8;
+/// ... with so many pairs of pixels ...
+const PROOF_PAIRS: u32 = 5 * PAIRS_MIN;
+/// ... and is then refuted when things move otherwise so many times on end: once may be a hand.
+const DOUBTS_MAX: u32 = 2;
 
 /// Below this share of the nominal speed the belt counts as slow: stopping or starting.
 const SLOW: f64 = 0.3;
@@ -134,10 +144,15 @@ pub struct Odometry {
     misses: u32,
     /// Frames that were missing though the time stamps did not tell.
     untold_gaps: u64,
+    /// Frames in which the texture proved to be the belt's.
+    proofs: u32,
+    /// Times since then that what lies on the belt moved otherwise, and whether it does now.
+    doubts: (u32, bool),
 }
 
 struct Match {
     shift_px: f64,
+    rho: f64,
     pairs: u32,
     /// Root of the texture's covariance, grey levels.
     texture_grey: f64,
@@ -218,6 +233,8 @@ impl Odometry {
             locked: false,
             misses: 0,
             untold_gaps: 0,
+            proofs: 0,
+            doubts: (0, false),
         })
     }
 
@@ -241,7 +258,7 @@ impl Odometry {
         let found = self.search(last_px, dt_s);
         // A search far off may have found that the steps before were assumed wrongly.
         let last_px = self.shift_px.unwrap_or(last_px);
-        let found = found.filter(|m| !self.refutes(ride, (m.shift_px - last_px) / dt_s));
+        let found = found.filter(|m| !self.refutes(ride, (m.shift_px - last_px) / dt_s, m.pairs));
         self.locked = found.is_some();
         let assumed_px = assumed_mm_per_s * dt_s / self.mm_per_px;
         let step_px = found.as_ref().map_or(assumed_px, |m| m.shift_px - last_px);
@@ -294,14 +311,32 @@ impl Odometry {
     }
 
     /// Whether what lies on the belt shows that it does not move so.
-    fn refutes(&mut self, ride: Ride, px_per_s: f64) -> bool {
+    fn refutes(&mut self, ride: Ride, px_per_s: f64, pairs: u32) -> bool {
         let speed_mm_per_s = px_per_s * self.mm_per_px;
         let steady = (speed_mm_per_s / self.speed_mm_per_s - 1.0).abs() < RIDE_MARGIN
             || speed_mm_per_s.abs() < STILL * self.expected.nominal_mm_per_s;
-        let refuted =
-            matches!(ride, Ride::Moves(ride) if steady && !self.may_carry(speed_mm_per_s, ride));
+        let (agrees, contradicts) = match ride {
+            Ride::Moves(ride) => {
+                let agrees = self.may_carry(speed_mm_per_s, ride);
+                (agrees, steady && !agrees)
+            }
+            Ride::Stands | Ride::Unknown => (false, false),
+        };
+        let as_expected = (speed_mm_per_s / self.expected.nominal_mm_per_s - 1.0).abs()
+            < self.expected.speed_error_max;
+        if (agrees || as_expected) && !contradicts && pairs >= PROOF_PAIRS {
+            self.proofs += 1;
+        }
+        if agrees {
+            self.doubts.0 = 0;
+        }
+        self.doubts.0 += u32::from(contradicts && !self.doubts.1);
+        self.doubts.1 = contradicts;
+        let is_proven = self.proofs >= PROOF_FRAMES && self.doubts.0 < DOUBTS_MAX;
+        let refuted = contradicts && !is_proven;
         if refuted {
             self.knowledge = Knowledge::Refuted;
+            self.proofs = 0;
         }
         refuted
     }
@@ -520,7 +555,7 @@ impl Odometry {
         let around = known.1.map(|c| c.rho);
         let texture_grey = self.unit_grey * c.covariance.max(0.0).sqrt();
         let shift_px = shift as f64 + peak(&around)?;
-        Some(Match { shift_px, pairs: c.pairs, texture_grey, missing: 0 })
+        Some(Match { shift_px, rho: c.rho, pairs: c.pairs, texture_grey, missing: 0 })
     }
 
     /// Normalised correlation of key and current texture, and the pixels that took part, the belt

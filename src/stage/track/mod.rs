@@ -6,8 +6,10 @@
 //! background or a hand does not. Neighbours that perspective or a shadow shows as one blob become
 //! two tracks once they have been seen apart.
 
+mod gap;
 mod state;
 
+pub use gap::Seen;
 pub use state::{Phase, Track};
 
 use super::segment::{Blob, PxBox};
@@ -66,6 +68,7 @@ pub enum Change {
 pub struct Tracker {
     mm_per_px: f64,
     magnification_max: f64,
+    width_px: usize,
     tracks: Block<Track>,
     owners: Block<u16>,
     changes: heapless::Vec<(usize, Change), 512>,
@@ -81,10 +84,16 @@ impl Tracker {
     }
 
     /// No tracks.
-    pub fn new(mm_per_px: f64, magnification_max: f64, memory: &mut Memory) -> Result<Self> {
+    pub fn new(
+        mm_per_px: f64,
+        magnification_max: f64,
+        width_px: usize,
+        memory: &mut Memory,
+    ) -> Result<Self> {
         Ok(Self {
             mm_per_px,
             magnification_max,
+            width_px,
             tracks: memory.take("track.tracks", FREE)?,
             owners: memory.take("track.owners", NOBODY)?,
             changes: heapless::Vec::new(),
@@ -357,7 +366,7 @@ mod tests {
             let mut plan = Plan::default();
             Tracker::plan(TRACKS, 16, &mut plan);
             let mut memory = plan.reserve(1).expect("small");
-            let tracker = Tracker::new(1.0, 1.2, &mut memory).expect("planned");
+            let tracker = Tracker::new(1.0, 1.2, 400, &mut memory).expect("planned");
             Self { tracker, at: BeltPosition::default() }
         }
 
