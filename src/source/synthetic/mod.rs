@@ -4,6 +4,7 @@
 //! grey level; [`noise`] is a separate step. Serves demo, tests and benchmarks.
 
 mod belt;
+mod board;
 mod lamps;
 pub mod noise;
 mod random;
@@ -12,6 +13,7 @@ mod scenario;
 mod sensor;
 mod solid;
 
+pub use board::{BoardStills, held_poses};
 pub use random::Random;
 pub use render::Renderer;
 pub use scenario::{Material, Parcel, Scenario};
