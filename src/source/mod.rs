@@ -2,6 +2,7 @@
 
 #[cfg(feature = "aravis")]
 mod aravis;
+mod codec;
 mod directory;
 mod fault_injector;
 mod feed;
