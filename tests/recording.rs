@@ -89,7 +89,7 @@ fn damaged_times_are_told_by_line_and_what_was_measured_is_written() {
     let mut y4m = b"YUV4MPEG2 W320 H240 F25:1 Ip Cmono\n".to_vec();
     for _ in 0..4 {
         y4m.extend(b"FRAME\n");
-        y4m.extend([60; 320 * 240]);
+        y4m.extend(vec![60; 320 * 240]);
     }
     fs::write(folder.join("recording.y4m"), y4m).expect("room");
     let head = "# frame number and seconds since the first frame, a line for every picture\n";
