@@ -144,16 +144,17 @@ mod tests {
         let mut codec = Codec::new(24.0, [61, 37]);
         let mut before = frame(0);
         codec.pass(&mut before);
+        let (mut moved, mut shown) = (0.0, 0.0);
         for index in 1..20 {
             let (truth, mut told) = (frame(index), frame(index));
             codec.pass(&mut told);
             let box_at = 20 * 61 + 30;
             assert!(told[box_at].abs_diff(160) < 24, "{}", told[box_at]);
-            // The belt moved, the picture of it did not.
-            let (moved, shown) =
-                (mean_difference(&truth, &frame(index - 1)), mean_difference(&told, &before));
-            assert!(moved > 0.8 && shown < 0.25 * moved, "frame {index}: {shown} of {moved}");
+            moved += mean_difference(&truth, &frame(index - 1));
+            shown += mean_difference(&told, &before);
             before = told;
         }
+        // The belt moved, the picture of it hardly did: a block's mean is told now and then.
+        assert!(moved > 0.8 * 19.0 && shown < 0.25 * moved, "{shown} of {moved}");
     }
 }

@@ -58,7 +58,7 @@ impl Verdict {
     }
 
     pub const HEADER: &'static str =
-        "class       parcels  once twice none false  usable silent   mean mm   99 % mm";
+        "class       parcels  once twice none false  usable  right silent   mean mm   99 % mm";
 
     pub fn line(&self, name: &str) -> String {
         let mut errors = self.errors_mm.clone();
@@ -66,13 +66,14 @@ impl Verdict {
         let mean = errors.iter().sum::<f64>() / errors.len().max(1) as f64;
         let p99 = errors.get(errors.len() * 99 / 100).copied().unwrap_or_default();
         format!(
-            "{name:11} {:7} {:5} {:5} {:4} {:5} {:6} % {:5} {mean:9.2} {p99:9.2}",
+            "{name:11} {:7} {:5} {:5} {:4} {:5} {:5} % {:4} % {:6} {mean:9.2} {p99:9.2}",
             self.parcels,
             self.once,
             self.twice,
             self.untold,
             self.false_records,
             100 * self.usable / self.parcels.max(1),
+            100 * self.right / self.parcels.max(1),
             self.silent
         )
     }

@@ -23,8 +23,8 @@ pub fn svg(bars: &[(&str, &Verdict)], worlds: usize) -> String {
     let mut svg = format!(
         "<svg xmlns=\"http://www.w3.org/2000/svg\" viewBox=\"0 0 820 {height}\" \
          font-family=\"sans-serif\" font-size=\"12\">\n<rect width=\"820\" height=\"{height}\" \
-         fill=\"white\"/>\n<text x=\"{LEFT}\" y=\"18\">Parcels of {worlds} worlds of each class; \
-         records of nothing at the right</text>\n"
+         fill=\"white\"/>\n<text x=\"{LEFT}\" y=\"18\">Parcels of every class, worlds drawn: \
+         {worlds} of each; at the right, records of nothing</text>\n"
     );
     for (k, (name, colour)) in FATES.iter().enumerate() {
         let x = LEFT + 155.0 * k as f64;
