@@ -165,7 +165,7 @@ pub fn visitors((class, mut random): (Class, Random), seconds: f64) -> String {
     if !class.has(Class::Visited) {
         return text;
     }
-    for _ in 0..1 + (random.unit() * 2.0) as usize {
+    for _ in 0..=(random.unit() * 2.0) as usize {
         let from_s = random.between([0.3, 0.8]) * seconds;
         if random.unit() < 0.3 {
             text += &cable(&mut random);

@@ -79,6 +79,11 @@ pub(super) struct Surface {
     dirt: Vec<Mark>,
     /// Marks in view in this frame, each with its middle; by columns of the belt.
     columns: Vec<Vec<(Mark, [f32; 2])>>,
+    /// How far tile and pattern have moved in this frame, and the belt to its side. Both repeat, so only
+    /// the travel within one of them matters.
+    tile_offset_mm: f32,
+    pattern_offset_mm: f32,
+    aside_mm: f32,
 }
 
 /// Columns that marks are looked up by, and how much of a belt they cover around the origin.
@@ -106,6 +111,9 @@ impl Surface {
             dirt,
             columns: vec![Vec::new(); if has_marks { COLUMNS } else { 0 }],
             table: table.clone(),
+            tile_offset_mm: 0.0,
+            pattern_offset_mm: 0.0,
+            aside_mm: 0.0,
         }
     }
 
@@ -115,8 +123,14 @@ impl Surface {
         (at >= 0.0 && at < COLUMNS as f32).then_some(at as usize)
     }
 
-    /// Note which marks are where.
+    /// Note where everything on it is.
     pub(super) fn place(&mut self, at: Position) {
+        let tile_mm = f64::from(TEXEL_MM) * TILE as f64;
+        self.tile_offset_mm = at.travel_mm.rem_euclid(tile_mm) as f32;
+        let pattern = self.table.pattern.as_ref();
+        self.pattern_offset_mm =
+            pattern.map_or(0.0, |p| at.travel_mm.rem_euclid(p.pitch_mm)) as f32;
+        self.aside_mm = at.aside_mm as f32;
         if self.columns.is_empty() {
             return;
         }
@@ -143,16 +157,16 @@ impl Surface {
     }
 
     /// Grey level in full light at a point under the camera. `px_mm`: edges are as wide as a pixel.
-    pub(super) fn grey(&self, [x, y]: [f32; 2], at: Position, px_mm: f32) -> f32 {
-        // Tile and pattern repeat, so only the travel within one of them matters.
-        let tile_mm = f64::from(TEXEL_MM) * TILE as f64;
-        let tile_offset = at.travel_mm.rem_euclid(tile_mm) as f32;
-        let y_on_belt = y - at.aside_mm as f32;
+    pub(super) fn grey(&self, [x, y]: [f32; 2], px_mm: f32) -> f32 {
+        let y_on_belt = y - self.aside_mm;
         let pattern = self.table.pattern.as_ref();
-        let repeated = pattern.map_or(0.0, |p| {
-            p.grey(x - at.travel_mm.rem_euclid(p.pitch_mm) as f32, y_on_belt, px_mm)
-        });
-        let bare = self.table.grey as f32 + self.texel(x - tile_offset, y_on_belt) + repeated;
+        let repeated =
+            pattern.map_or(0.0, |p| p.grey(x - self.pattern_offset_mm, y_on_belt, px_mm));
+        let texture = self.texel(x - self.tile_offset_mm, y_on_belt);
+        let bare = self.table.grey as f32 + texture + repeated;
+        if self.columns.is_empty() {
+            return bare.max(0.0);
+        }
         let marks = Self::column(x).and_then(|column| self.columns.get(column));
         let marked = marks.into_iter().flatten().fold(bare, |grey, (mark, middle)| {
             let share = mark.share([x - middle[0], y - middle[1]], px_mm);

@@ -85,7 +85,7 @@ impl Renderer {
             - self.scenario.travel_mm(t_s - half_exposure_s)) as f32;
         let at = Position { travel_mm, aside_mm: self.scenario.aside_mm(t_s) };
         self.belt.place(at);
-        self.render_belt(at, light, frame);
+        self.render_belt(light, frame);
         let solids = self.place_solids(at);
         for solid in &solids {
             self.cast_shadow(solid, frame);
@@ -116,12 +116,12 @@ impl Renderer {
         self.solids = solids;
     }
 
-    fn render_belt(&self, at: Position, light: f32, frame: &mut [u16]) {
+    fn render_belt(&self, light: f32, frame: &mut [u16]) {
         let half_width = 0.5 * self.scenario.belt.width_mm as f32;
         let px_mm = self.px_mm();
         for (i, (out, &[x, y])) in frame.iter_mut().zip(&self.ground).enumerate() {
             let (surface, shine) = if y.abs() <= half_width {
-                (self.belt.grey([x, y], at, px_mm), self.light.shine(i))
+                (self.belt.grey([x, y], px_mm), self.light.shine(i))
             } else if y.abs() <= half_width + RAIL_MM {
                 (120.0, 0.0)
             } else {
