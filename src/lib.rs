@@ -14,7 +14,7 @@
 //! - [`kernel`]: pixel loops on slices, a readable one and one in vectors. [`stage`]: the steps that own state.
 //! - [`belt`]: where the belt is. [`pipeline`]: the steps in order. [`event`]: what comes out.
 //! - [`sandbox`]: child processes for what strangers bring.
-//! - [`source`]: where frames come from. [`plc`]: how records reach the PLC.
+//! - [`source`]: where frames come from, and what records them. [`plc`]: how records reach the PLC.
 //! - [`store`]: the appliance's disk: configurations in force, sticks, whom it trusts.
 //! - [`run`]: threads and rings; the only room that knows source, pipeline, plc and store.
 //!

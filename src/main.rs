@@ -5,6 +5,7 @@ use beltgauge::camera::chessboard::Chessboard;
 use beltgauge::config::Site;
 use beltgauge::error::{Error, Result};
 use beltgauge::event::ParcelRecord;
+use beltgauge::run::board;
 use beltgauge::run::budget::{self, StraightDown};
 use beltgauge::run::calibrate::{self, DataSheet};
 use beltgauge::run::offline::{self, Observer, Outputs};
@@ -17,7 +18,7 @@ use clap::{Parser, Subcommand};
 use std::io::{IsTerminal, Write};
 use std::net::SocketAddr;
 use std::ops::RangeInclusive;
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 use std::process::ExitCode;
 use tracing::Level;
 
@@ -51,6 +52,9 @@ enum Command {
         /// Feed the hardware's watchdog, for example /dev/watchdog.
         #[arg(long)]
         watchdog: Option<PathBuf>,
+        /// Record the camera's frames to this new Y4M file, their times to FILE.times beside it.
+        #[arg(long)]
+        record: Option<PathBuf>,
     },
     /// Run the appliance on a synthetic belt: no camera, no PLC needed.
     Demo {
@@ -66,6 +70,9 @@ enum Command {
         /// File with tables of a configuration that replace the demo's own, for example [can].
         #[arg(long)]
         config: Option<PathBuf>,
+        /// Folder for a recording, its site, and stills to calibrate its camera with.
+        #[arg(long)]
+        record: Option<PathBuf>,
     },
     /// Measure a recording, as fast as it goes.
     Measure {
@@ -94,6 +101,18 @@ enum Command {
     /// Calibrate the camera: first its lens, then its place over the belt.
     #[command(subcommand)]
     Calibrate(Calibrate),
+    /// Draw a chessboard to print, in true size.
+    Board {
+        /// Squares along both sides; 10x7 squares have 9x6 inner corners.
+        #[arg(long, value_parser = squares)]
+        squares: [usize; 2],
+        /// Side of a square.
+        #[arg(long, value_parser = positive)]
+        square_mm: f64,
+        /// File to write, .svg or .pdf.
+        #[arg(long)]
+        out: PathBuf,
+    },
     /// What a geometry can measure: expected standard deviations, before anything is bought.
     Budget(Budget),
     /// Validate a configuration and print the memory plan.
@@ -261,6 +280,14 @@ fn sides(text: &str) -> std::result::Result<[usize; 2], String> {
     }
 }
 
+fn squares(text: &str) -> std::result::Result<[usize; 2], String> {
+    let sides = text.split_once(['x', 'X']).map(|(a, b)| [a.trim().parse(), b.trim().parse()]);
+    match sides {
+        Some([Ok(a), Ok(b)]) => Ok([a, b]),
+        _ => Err("give the squares along both sides, as 10x7".to_owned()),
+    }
+}
+
 fn positive(text: &str) -> std::result::Result<f64, String> {
     match text.parse::<f64>() {
         Ok(value) if value > 0.0 && value <= 10_000.0 => Ok(value),
@@ -335,9 +362,9 @@ impl Observer for Console {
 
 fn dispatch(command: Command) -> Result<()> {
     match command {
-        Command::Demo { seconds, out, listen, config } => {
-            let config = config.as_deref();
-            let table = demo::run(demo::Options { seconds, out: &out, listen, config })?;
+        Command::Demo { seconds, out, listen, config, record } => {
+            let (config, record) = (config.as_deref(), record.as_deref());
+            let table = demo::run(demo::Options { seconds, out: &out, listen, config, record })?;
             print(format_args!("{table}\npictures and records are in {}", out.display()))
         }
         Command::Measure { input, config, fps, jsonl, annotate, explain, inject } => {
@@ -360,12 +387,14 @@ fn dispatch(command: Command) -> Result<()> {
             print(format_args!("{counters}"))
         }
         Command::Calibrate(what) => calibrate(what),
+        Command::Board { squares, square_mm, out } => print_board(squares, square_mm, &out),
         Command::Budget(what) => print_budget(&what),
-        Command::Run { config, store, status, watchdog } => live::run(&live::Options {
+        Command::Run { config, store, status, watchdog, record } => live::run(&live::Options {
             config: config.as_deref(),
             store: &store,
             status: status.as_deref(),
             watchdog: watchdog.as_deref(),
+            record: record.as_deref(),
         }),
         Command::Import { dir, store, .. } => {
             let store = Store::new(&store);
@@ -394,6 +423,20 @@ fn dispatch(command: Command) -> Result<()> {
             print(format_args!("the configuration is valid"))
         }
     }
+}
+
+fn print_board(squares: [usize; 2], square_mm: f64, out: &Path) -> Result<()> {
+    let sheet = board::sheet(squares, square_mm)?;
+    sheet.save(out)?;
+    if Chessboard::new(squares.map(|n| n - 1), square_mm).is_symmetric() {
+        let _ = writeln!(
+            std::io::stderr(),
+            "warning: this board looks the same after half a turn; an even count along one side and an \
+             odd one along the other tell its ends apart"
+        );
+    }
+    let [squares, page] = &sheet.text;
+    print(format_args!("wrote {}: {squares}\n{page}", out.display()))
 }
 
 fn print_budget(what: &Budget) -> Result<()> {

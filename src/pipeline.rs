@@ -29,6 +29,11 @@ use crate::units::{BeltMm, BeltPx, BeltRect};
 use motion::Witnesses;
 use nalgebra::Vector2;
 
+/// What rode this share of the zone with the belt is no hand, and no piece: those vanish sooner.
+const RODE_SHARE: f64 = 0.5;
+/// A frame that is older than the last one by less than this, s, came out of order. A clock that was
+/// set back further begins anew.
+const LATE_MAX_S: f64 = 1.0;
 /// Around a parcel this many px are not learned as background: its blurred border.
 const HOLD_MARGIN_PX: usize = 2;
 /// Around a parcel this many px are no witness of the belt's motion: blur and compression
@@ -163,6 +168,10 @@ impl Pipeline {
         let at_frame = |e: Error| e.at(format!("frame {}", time.index));
         self.site.check_image_size([raw.width(), raw.height()]).map_err(at_frame)?;
         let dt_s = self.last.map_or(0.0, |last| time.t_s - last.t_s);
+        // What it shows is known from the frames around it.
+        if (-LATE_MAX_S..0.0).contains(&dt_s) {
+            return Ok(());
+        }
         self.last = Some(time);
         self.counters.frames += 1;
 
@@ -409,7 +418,7 @@ impl Pipeline {
         // A pass that was cut short counts only if edges were found.
         let measured = measured.filter(|m| m.has_edges || flags == Flags::default());
         // What vanished before it had a shape was a hand, or a piece that joined its parcel, unless it
-        // has ridden through the zone and is as large as a parcel: a sorter must know of it.
+        // has ridden through most of the zone, as large as a parcel: a sorter must know of it.
         let vanished = measured.is_none() && reason == NotMeasured::Lost && !had_shape;
         if vanished && !self.rode(slot) {
             return;
@@ -430,15 +439,16 @@ impl Pipeline {
         length_mm * width_mm >= segment.area_min_mm2 && length_mm.min(width_mm) >= side_min_mm
     }
 
-    /// Whether the middle of a track's image, as large as the smallest parcel, has been in the zone.
+    /// Whether a track's image, as large as the smallest parcel, has ridden through most of the zone.
     fn rode(&self, slot: usize) -> bool {
         let track = &self.tracker.tracks()[slot];
         let sides_px = [track.bounds.u1 - track.bounds.u0, track.bounds.v1 - track.bounds.v0];
         let here_mm = self.image_on_belt(slot).x;
         let first_mm = here_mm - (self.at.travel_mm - track.first.travel_mm);
+        let from_mm = here_mm.min(first_mm).max(self.zone.x_min_mm);
+        let to_mm = here_mm.max(first_mm).min(self.zone.x_max_mm);
         self.counts(sides_px.map(|px| f64::from(px) * self.site.view.mm_per_px))
-            && here_mm.min(first_mm) <= self.zone.x_max_mm
-            && here_mm.max(first_mm) >= self.zone.x_min_mm
+            && to_mm - from_mm > RODE_SHARE * self.zone.length_mm()
     }
 
     /// Where the middle of a track's image lies on the belt.

@@ -345,6 +345,31 @@ fn an_encoder_that_shows_another_travel_than_the_belt_is_found_out() {
 }
 
 #[test]
+fn a_frame_that_comes_after_its_successor_is_left_out() {
+    let scenario = boxes(2, 60.0, 2.0, "");
+    let mut source = Synthetic::new(scenario.clone()).expect("renders");
+    let (mut frames, mut pipeline) = beltgauge::run::build(site(&scenario, 500.0)).expect("fits");
+    let mut frame = frames.pop().expect("planned");
+    let (mut records, mut late) = (Vec::new(), None);
+    while let Some(time) = source.next_into(&mut frame).expect("renders") {
+        if time.index > 20 && time.index % 10 == 0 {
+            late = Some((frame.to_vec(), time));
+            continue;
+        }
+        let mut step = |frame: &[u8], time| {
+            let raw = Plane::packed(frame, 640, 400).expect("this size");
+            pipeline.step(raw, time, &mut |r| records.push(r)).expect("this size");
+        };
+        step(&frame, time);
+        if let Some((frame, time)) = late.take() {
+            step(&frame, time);
+        }
+    }
+    let right = records.iter().all(|r| is_right(r) && r.may_be_used);
+    assert!(records.len() == 2 && right, "{records:#?}");
+}
+
+#[test]
 fn frames_missing_without_a_word_are_bridged_and_told() {
     let scenario = boxes(2, 60.0, 2.0, "");
     for every in [8, 30] {

@@ -1,12 +1,12 @@
 //! `beltgauge demo`: the appliance in real time on the synthetic belt, and the truth beside it.
 
 use super::annotate::draw;
-use super::{Appliance, Progress, log};
+use super::{Appliance, Progress, demo_kit, log};
 use crate::config::{Config, Site};
 use crate::error::{Error, Result};
 use crate::event::ParcelRecord;
 use crate::source::synthetic::{Parcel, Scenario, Synthetic};
-use crate::source::{FrameSource, Pace, Paced};
+use crate::source::{Feed, FrameSource, Pace, Paced, Recorder};
 use std::fmt::Write as _;
 use std::net::SocketAddr;
 use std::path::Path;
@@ -14,6 +14,8 @@ use std::time::{Duration, Instant};
 
 const SCENARIO: &str = include_str!("../../config/demo/scenario.toml");
 const CONFIG: &str = include_str!("../../config/demo/beltgauge.toml");
+/// The recording in the folder of `--record`.
+const RECORDING: &str = "recording.y4m";
 /// A record belongs to the parcel whose true centre is this near.
 const MATCH_MM: f64 = 60.0;
 /// The console line is renewed this often.
@@ -30,6 +32,8 @@ pub struct Options<'a> {
     pub listen: Option<SocketAddr>,
     /// File with other tables of a configuration, for example `[can]`.
     pub config: Option<&'a Path>,
+    /// Folder for a recording, and all that measuring it again and calibrating its camera needs.
+    pub record: Option<&'a Path>,
 }
 
 /// The demo's scenario.
@@ -88,20 +92,34 @@ pub fn run(options: Options<'_>) -> Result<String> {
     log::say(format_args!(
         "rendering the belt; Modbus TCP on {listen}, registers as in config/REGISTERS.md\n"
     ));
-    let mut source = Synthetic::new(scenario)?;
+    let mut source = Synthetic::new(scenario.clone())?;
     let appliance = Appliance::new(site)?;
+    let mut paced = Paced::new(&mut source, Pace::RealTime);
+    let mut recorder = None;
+    let feed: &mut dyn Feed = match options.record {
+        None => &mut paced,
+        Some(folder) => {
+            std::fs::create_dir_all(folder).map_err(failed)?;
+            // First: it refuses the folder of an earlier recording.
+            let recorder = recorder.insert(Recorder::create(&mut paced, &folder.join(RECORDING))?);
+            demo_kit::write(folder, &scenario, &camera, CONFIG)?;
+            recorder
+        }
+    };
     let mut records: Vec<ParcelRecord> = Vec::new();
     let (start, mut shown) = (Instant::now(), Instant::now());
-    let progress =
-        appliance.run(&mut Paced::new(&mut source, Pace::RealTime), |progress, new| {
-            records.extend(new);
-            if shown.elapsed() >= CONSOLE_PERIOD {
-                shown = Instant::now();
-                console(progress, start.elapsed(), records.last());
-            }
-            start.elapsed().as_secs_f64() < options.seconds
-        })?;
+    let progress = appliance.run(feed, |progress, new| {
+        records.extend(new);
+        if shown.elapsed() >= CONSOLE_PERIOD {
+            shown = Instant::now();
+            console(progress, start.elapsed(), records.last());
+        }
+        start.elapsed().as_secs_f64() < options.seconds
+    })?;
     log::say(format_args!("\n"));
+    if let Some(recorder) = recorder {
+        log::say(format_args!("{}\n", recorder.finish()?));
+    }
     let mut lines = Vec::new();
     for record in &records {
         serde_json::to_writer(&mut lines, record).map_err(|e| failed(e.into()))?;

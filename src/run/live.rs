@@ -6,7 +6,7 @@ use crate::error::{Error, Result};
 use crate::event::ParcelRecord;
 use crate::plc::interface;
 use crate::plc::registers::ImportStatus;
-use crate::source::{Live, open_camera};
+use crate::source::{Feed, Live, Recorder, open_camera};
 use crate::store::{ImportRecord, Store};
 use serde::Serialize;
 use signal_hook::consts::{SIGINT, SIGTERM};
@@ -29,6 +29,8 @@ pub struct Options<'a> {
     pub status: Option<&'a Path>,
     /// The hardware's watchdog.
     pub watchdog: Option<&'a Path>,
+    /// Y4M file to record the frames to.
+    pub record: Option<&'a Path>,
 }
 
 /// Run until SIGTERM or SIGINT; parcels that are inside then are lost.
@@ -48,7 +50,12 @@ pub fn run(options: &Options<'_>) -> Result<()> {
     }
     let can = CanSetUp { settings: site.config.can.clone(), done: None, complaint: None };
     let camera = site.config.camera.clone();
-    let mut feed = Live::new(camera, site.camera.image_size_px, open_camera);
+    let mut live = Live::new(camera, site.camera.image_size_px, open_camera);
+    let mut recorder = None;
+    let feed: &mut dyn Feed = match options.record {
+        None => &mut live,
+        Some(path) => recorder.insert(Recorder::create(&mut live, path)?),
+    };
     let listen = site.config.modbus.listen;
     let watchdog = Watchdog::new(options.watchdog)?;
     let (appliance, imports) = Appliance::new(site)?.supervised(watchdog);
@@ -64,7 +71,7 @@ pub fn run(options: &Options<'_>) -> Result<()> {
     };
     housekeeping.start()?;
     let mut seen = false;
-    let progress = appliance.run(&mut feed, |progress, records| {
+    let result = appliance.run(feed, |progress, records| {
         records.for_each(|record| log_parcel(&record));
         if !seen && progress.status.counters.frames > 0 {
             seen = true;
@@ -72,8 +79,15 @@ pub fn run(options: &Options<'_>) -> Result<()> {
         }
         *seen_last.lock().unwrap_or_else(PoisonError::into_inner) = *progress;
         !stop.load(Ordering::Relaxed)
-    })?;
-    tracing::info!("stopped; {}", progress.status.counters);
+    });
+    // However it ended: the recording may show why.
+    if let Some(recorder) = recorder {
+        match recorder.finish() {
+            Ok(recorded) => tracing::info!("{recorded}"),
+            Err(e) => tracing::error!("{e}"),
+        }
+    }
+    tracing::info!("stopped; {}", result?.status.counters);
     Ok(())
 }
 

@@ -3,9 +3,11 @@
 
 mod annotate;
 mod appliance;
+pub mod board;
 pub mod budget;
 pub mod calibrate;
 pub mod demo;
+mod demo_kit;
 mod explain;
 pub mod import;
 pub mod live;

@@ -2,14 +2,17 @@
 
 #[cfg(feature = "aravis")]
 mod aravis;
+mod codec;
 mod directory;
 mod fault_injector;
 mod feed;
 pub(crate) mod gige;
 pub(crate) mod pixels;
+mod recorder;
 mod repeats;
 pub(crate) mod still;
 pub mod synthetic;
+mod times;
 #[cfg(feature = "v4l2")]
 mod v4l2;
 mod y4m;
@@ -17,7 +20,9 @@ mod y4m;
 pub use directory::Directory;
 pub use fault_injector::{FaultInjector, Faults};
 pub use feed::{Arrival, Driver, Feed, FeedStatus, Live, Next, Pace, Paced, Taken};
+pub use recorder::{Recorded, Recorder};
 pub use still::{Still, stills_in};
+pub use times::times_beside;
 pub use y4m::Y4m;
 
 use crate::config::{CameraTable, Interface};
@@ -25,6 +30,7 @@ use crate::error::{Error, Result};
 use crate::image::FrameTime;
 use repeats::WithoutRepeats;
 use std::path::Path;
+use times::Timed;
 
 /// Frame rates that make sense: slower, a parcel is hardly seen twice.
 const FPS: std::ops::RangeInclusive<f64> = 0.5..=10_000.0;
@@ -99,5 +105,10 @@ pub fn open(input: &Path, fps: Option<f64>) -> Result<Box<dyn FrameSource>> {
     let file = std::fs::File::open(input)
         .map_err(|e| Error::failure(format!("cannot open the input: {e}")).in_file(input))?;
     let y4m = Y4m::new(Box::new(file), &input.display().to_string(), fps)?;
+    let times = times_beside(input);
+    // A rate that is given overrules them. With its true times no picture was put into a gap.
+    if fps.is_none() && times.exists() {
+        return Ok(Box::new(Timed::new(y4m, times)?));
+    }
     Ok(Box::new(WithoutRepeats::new(y4m)))
 }

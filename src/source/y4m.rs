@@ -131,7 +131,7 @@ impl FrameSource for Y4m {
 }
 
 /// A line without its end; `None` at the end of the stream. A line too long comes back cut.
-fn read_line(reader: &mut impl BufRead) -> std::io::Result<Option<String>> {
+pub(super) fn read_line(reader: &mut impl BufRead) -> std::io::Result<Option<String>> {
     let mut line = Vec::new();
     reader.take(LINE_BYTES_MAX).read_until(b'\n', &mut line)?;
     if line.is_empty() {

@@ -62,7 +62,11 @@ pub fn write_site(folder: &Path, image_size_px: [usize; 2]) -> PathBuf {
 
 /// What the pipeline of a site reports of a synthetic belt.
 pub fn measure_scenario(scenario: &Scenario, site: Site) -> Vec<ParcelRecord> {
-    let mut source = Synthetic::new(scenario.clone()).expect("renders");
+    measure_frames(&mut Synthetic::new(scenario.clone()).expect("renders"), site)
+}
+
+/// What the pipeline of a site reports of frames.
+pub fn measure_frames(source: &mut dyn FrameSource, site: Site) -> Vec<ParcelRecord> {
     let (mut frames, mut pipeline) = beltgauge::run::build(site).expect("fits");
     let mut frame = frames.pop().expect("planned");
     let [width, height] = source.size_px();

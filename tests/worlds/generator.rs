@@ -1,110 +1,69 @@
 //! Draws worlds: a seed and a class of difficulty for every property make a scenario.
 
+use super::class::{Class, Property, WorldSeed};
+use super::riders;
 use beltgauge::config::{Config, Site};
+use beltgauge::source::Faults;
 use beltgauge::source::synthetic::{Random, Scenario};
 use nalgebra::{Matrix3, Rotation3, Vector3};
 use std::fmt::Write as _;
 
-const FPS: f64 = 40.0;
+pub const FPS: f64 = 40.0;
 const SIZE_PX: [f64; 2] = [800.0, 512.0];
-const ZONE_HALF_MM: [f64; 2] = [420.0, 280.0];
+pub const ZONE_HALF_MM: [f64; 2] = [420.0, 280.0];
 const BELT_WIDTH_MM: f64 = 640.0;
 
-/// How hard.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub enum Class {
-    /// Even light, free belt, single cartons.
-    Easy,
-    /// Large lamps, every material, light that drifts, a belt that swings a little.
-    Industrial,
-    /// One or two small lamps: hard shadows, glare.
-    HardLight,
-    /// Black cartons a few cm apart.
-    Dense,
-    /// Ribs or modules of strict pitch.
-    Periodic,
-    /// 2 to 6 grey levels of noise, blur, JPEG.
-    Noisy,
-    /// All of it.
-    Extreme,
-}
-
-impl Class {
-    pub const ALL: [(Self, &'static str); 7] = [
-        (Self::Easy, "easy"),
-        (Self::Industrial, "industrial"),
-        (Self::HardLight, "hard_light"),
-        (Self::Dense, "dense"),
-        (Self::Periodic, "periodic"),
-        (Self::Noisy, "noisy"),
-        (Self::Extreme, "extreme"),
-    ];
-
-    /// Whether a world of this class has what `other` is about.
-    fn has(self, other: Self) -> bool {
-        self == other || self == Self::Extreme
-    }
-}
-
-/// What can be drawn on its own.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub enum Property {
-    Camera,
-    Belt,
-    Light,
-    Noise,
-    Sensor,
-    Parcels,
-}
-
-impl Property {
-    pub const ALL: [Self; 6] =
-        [Self::Camera, Self::Belt, Self::Light, Self::Noise, Self::Sensor, Self::Parcels];
-}
-
-/// A scenario, its text and the site that measures it.
+/// A scenario, its text, the site that measures it, and what happens to its frames on the way.
 pub struct World {
     pub text: String,
     pub scenario: Scenario,
     pub site: Site,
+    pub faults: Faults,
 }
 
 /// The world of a seed; `class_of` says how hard each property is.
 pub fn draw(seed: u64, class_of: impl Fn(Property) -> Class) -> World {
-    // Each property has its own generator: making one easy leaves the others as they are.
-    let random = |property: Property| {
-        Random(seed.wrapping_mul(0x9e37_79b9) ^ (property as u64 + 1).wrapping_mul(0x85eb_ca6b))
+    let seeds = WorldSeed(seed);
+    let of = |property: Property| {
+        let class = class_of(property).of_property(property, seeds);
+        (class, seeds.random(property))
     };
-    let mut belt_random = random(Property::Belt);
+    let (belt_class, mut belt_random) = of(Property::Belt);
     let speed = belt_random.between([0.4_f64.ln(), 1.2_f64.ln()]).exp() * 1000.0;
     let nominal = speed * belt_random.between([0.97, 1.03]);
-    let camera = camera(class_of(Property::Camera), &mut random(Property::Camera));
-    let belt = belt(class_of(Property::Belt), speed, &mut belt_random);
-    let light = light(class_of(Property::Light), &mut random(Property::Light));
-    let noise = noise(class_of(Property::Noise), &mut random(Property::Noise));
-    let sensor = sensor(class_of(Property::Sensor), &mut random(Property::Sensor));
-    let (parcels, last_mm) = parcels(class_of(Property::Parcels), &mut random(Property::Parcels));
-    let frames = ((ZONE_HALF_MM[0] + 400.0 - last_mm) / speed * FPS) as u64 + 5;
-    let text = format!(
-        "seed = {seed}\nfps = {FPS}\nframes = {frames}\nexposure_ms = 1.0\n\
-         {camera}{belt}{light}{noise}{sensor}{parcels}"
-    );
-    let scenario = Scenario::parse(&text).expect("a valid scenario");
+    let camera = camera(of(Property::Camera));
+    let belt = belt(belt_class, speed, &mut belt_random) + &motion(of(Property::Motion));
+    let wear = wear(of(Property::Wear));
+    let light = light(of(Property::Light), of(Property::Sun));
+    let noise = noise(of(Property::Noise));
+    let sensor = sensor(of(Property::Sensor));
+    let (parcels, last_mm) = riders::parcels(&of);
+    let visitors = riders::visitors(of(Property::Visitors), (ZONE_HALF_MM[0] - last_mm) / speed);
+    let faults = transport(of(Property::Transport), seed);
+    let text = format!("{camera}{belt}{wear}{light}{noise}{sensor}{parcels}{visitors}");
+    let of_length = |frames: u64| {
+        format!("seed = {seed}\nfps = {FPS}\nframes = {frames}\nexposure_ms = 1.0\n{text}")
+    };
+    let parse = |text: &str| Scenario::parse(text).unwrap_or_else(|e| panic!("{e}\n{text}"));
+    let text = of_length(riders::frames_until_all_have_left(&parse(&of_length(1))));
+    let scenario = parse(&text);
     let [x, y] = ZONE_HALF_MM;
     let config = format!(
         "[camera]\ncalibration = \"the scenario's\"\n[belt]\nspeed_mm_per_s = {nominal}\n\
-         [zone]\nx_min_mm = -{x}\nx_max_mm = {x}\ny_min_mm = -{y}\ny_max_mm = {y}\n"
+         [zone]\nx_min_mm = -{x}\nx_max_mm = {x}\ny_min_mm = -{y}\ny_max_mm = {y}\n\
+         [view]\nheight_max_mm = {}\n",
+        riders::HEIGHT_MAX_MM
     );
     let camera = scenario.camera().expect("a valid camera");
     let site = Site::new(Config::parse(&config).expect("valid"), camera).expect("a zone in view");
-    World { text, scenario, site }
+    World { text, scenario, site, faults }
 }
 
 /// About 1.6 mm a pixel; looks at the middle of the zone.
-fn camera(class: Class, random: &mut Random) -> String {
+fn camera((class, mut random): (Class, Random)) -> String {
     let (heights, tilts) = match class {
         Class::Easy => ([1300.0, 1700.0], [0.0, 5.0]),
-        Class::Extreme => ([900.0, 2500.0], [5.0, 25.0_f64]),
+        Class::Extreme => ([1250.0, 2500.0], [5.0, 25.0_f64]),
         _ => ([1200.0, 2200.0], [0.0, 12.0]),
     };
     let height_mm = random.between(heights);
@@ -119,11 +78,16 @@ fn camera(class: Class, random: &mut Random) -> String {
     let f = centre.norm() / random.between([1.5, 1.7]);
     let [w, h] = SIZE_PX;
     let barrel = random.between([-0.2, -0.05]);
+    // The same view through a fisheye: r = f (angle + k1 angle^3), k1 about that of the barrel.
+    let lens = if class != Class::Easy && random.unit() < 0.25 {
+        format!("\"fisheye\"\ndistortion = [{}, 0.01, 0, 0]", 0.25 * barrel)
+    } else {
+        format!("\"brown\"\ndistortion = [{barrel}, 0.06, 0, 0, 0]")
+    };
     let row = |i: usize| format!("[{}, {}, {}]", r[(i, 0)], r[(i, 1)], r[(i, 2)]);
     format!(
-        "[camera]\nimage_size_px = [{w}, {h}]\n[camera.lens]\nmodel = \"brown\"\n\
-         fx_px = {f}\nfy_px = {f}\ncx_px = {}\ncy_px = {}\ndistortion = [{barrel}, 0.06, 0, 0, 0]\n\
-         [camera.pose]\nrotation = [{}, {}, {}]\ntranslation_mm = [{}, {}, {}]\n",
+        "[camera]\nimage_size_px = [{w}, {h}]\n[camera.lens]\nmodel = {lens}\n\
+         fx_px = {f}\nfy_px = {f}\ncx_px = {}\ncy_px = {}\n[camera.pose]\nrotation = [{}, {}, {}]\ntranslation_mm = [{}, {}, {}]\n",
         0.5 * w + random.between([-15.0, 15.0]),
         0.5 * h + random.between([-15.0, 15.0]),
         row(0),
@@ -136,36 +100,107 @@ fn camera(class: Class, random: &mut Random) -> String {
 }
 
 fn belt(class: Class, speed: f64, random: &mut Random) -> String {
+    let periodic = class.has(Class::Periodic);
     let texture = match class {
         Class::Easy => 1.3,
+        // As moulded plastic: nothing but the pattern. What noise hides does no harm.
+        _ if periodic && random.unit() < 0.75 => 0.0,
         Class::Extreme => random.between([0.1, 20.0]),
         _ => random.between([0.6, 4.0]),
     };
     let grey = if class == Class::Easy { 45.0 } else { random.between([25.0, 90.0]) };
-    let ripple = if class == Class::Easy { 0.0 } else { random.between([0.0, 0.02]) };
     let mut text = format!(
         "[belt]\nspeed_mm_per_s = {speed}\nwidth_mm = {BELT_WIDTH_MM}\ngrey = {grey}\n\
-         texture_grey = {texture}\nripple = {ripple}\nripple_period_s = 1.7\n"
+         texture_grey = {texture}\n"
     );
-    if class.has(Class::Periodic) {
-        let kind = ["woven", "ribbed", "modular"][(random.unit() * 3.0) as usize];
-        let pitch = random.between([5.0_f64.ln(), 60.0_f64.ln()]).exp();
-        let rows = if random.unit() < 0.5 { 0.0 } else { random.between([60.0, 150.0]) };
+    if periodic {
+        let kind = ["modular", "modular", "ribbed", "woven"][(random.unit() * 4.0) as usize];
+        let pitch = random.between([8.0_f64.ln(), 60.0_f64.ln()]).exp();
+        let rows = if random.unit() < 0.3 { 0.0 } else { random.between([60.0, 150.0]) };
+        let pattern = format!(
+            "kind = \"{kind}\", pitch_mm = {pitch}, contrast_grey = {}, gap_mm = {}, row_mm = {rows}",
+            random.between([0.15, 0.7]) * grey,
+            random.between([0.06, 0.15]) * pitch
+        );
+        let _ = writeln!(text, "pattern = {{ {pattern} }}");
+    }
+    text
+}
+
+/// How it runs: swings of speed, to the side, stops, and creeping back. Goes on with `[belt]`.
+fn motion((class, mut random): (Class, Random)) -> String {
+    if class == Class::Easy {
+        return String::new();
+    }
+    let mut text = format!("ripple = {}\nripple_period_s = 1.7\n", random.between([0.0, 0.02]));
+    if class.has(Class::Worn) {
+        let _ = writeln!(
+            text,
+            "side_drift_mm = {}\nside_drift_period_s = {}",
+            random.between([0.0, 6.0]),
+            random.between([3.0, 9.0])
+        );
+        if random.unit() < 0.6 {
+            let _ = writeln!(
+                text,
+                "stop = [{{ at_s = {}, for_s = {}, ramp_s = 0.3, back_mm = {} }}]",
+                random.between([1.5, 3.0]),
+                random.between([0.3, 1.2]),
+                if random.unit() < 0.5 { 0.0 } else { random.between([2.0, 20.0]) }
+            );
+        }
+    }
+    text
+}
+
+/// Dirt, seams, labels that stick, shine. Goes on with `[belt]`, and has tables of it.
+fn wear((class, mut random): (Class, Random)) -> String {
+    if !class.has(Class::Worn) {
+        return String::new();
+    }
+    let mut text = format!("shine = {}\n", random.between([0.0, 0.5]));
+    let _ = write!(
+        text,
+        "[belt.dirt]\nper_m2 = {}\nsize_mm = [4, 70]\ngrey = [{}, {}]\n",
+        random.between([5.0, 150.0]),
+        random.between([5.0, 40.0]),
+        random.between([60.0, 150.0])
+    );
+    // A seam, as belts have one, and labels that came off a parcel.
+    let _ = write!(
+        text,
+        "[[belt.mark]]\nx_mm = {}\ny_mm = 0\nlength_mm = {}\nwidth_mm = {BELT_WIDTH_MM}\nyaw_deg = {}\n\
+         grey = {}\n",
+        random.between([-1800.0, 0.0]),
+        random.between([3.0, 30.0]),
+        random.between([-20.0, 20.0]),
+        random.between([5.0, 120.0])
+    );
+    for _ in 0..(random.unit() * 4.0) as usize {
         let _ = write!(
             text,
-            "[belt.pattern]\nkind = \"{kind}\"\npitch_mm = {pitch}\ncontrast_grey = {}\n\
-             gap_mm = {}\nrow_mm = {rows}\n",
-            random.between([8.0, 25.0]),
-            0.15 * pitch
+            "[[belt.mark]]\nx_mm = {}\ny_mm = {}\nlength_mm = {}\nwidth_mm = {}\nyaw_deg = {}\n\
+             grey = {}\n",
+            random.between([-2000.0, 300.0]),
+            random.between([-220.0, 220.0]),
+            random.between([50.0, 150.0]),
+            random.between([30.0, 100.0]),
+            random.between([-90.0, 90.0]),
+            random.between([120.0, 215.0])
         );
     }
     text
 }
 
-fn light(class: Class, random: &mut Random) -> String {
+fn light((class, mut random): (Class, Random), (sun_class, sun): (Class, Random)) -> String {
+    let sun = sunshine(sun_class, sun);
     let hard = class.has(Class::HardLight);
     let (lamps, radius, ambient) = match class {
-        Class::Easy => return "[light]\ndrift = 0.03\ndrift_period_s = 3.0\nshadow = 0.4\n".into(),
+        // Without lamps light comes from everywhere, and the sun would have no shadow to throw.
+        Class::Easy if sun.is_empty() => {
+            return "[light]\ndrift = 0.03\ndrift_period_s = 3.0\nshadow = 0.4\n".into();
+        }
+        Class::Easy => (3, [350.0, 350.0], [0.6, 0.6]),
         _ if hard => (1 + (random.unit() * 2.0) as usize, [8.0, 60.0], [0.1, 0.3]),
         _ => (2 + (random.unit() * 3.0) as usize, [150.0, 350.0], [0.35, 0.6]),
     };
@@ -191,10 +226,39 @@ fn light(class: Class, random: &mut Random) -> String {
             (1.0 - ambient) / lamps as f64
         );
     }
-    text
+    text + &sun
 }
 
-fn noise(class: Class, random: &mut Random) -> String {
+/// A patch of sun on the belt: a lamp far away, behind a window.
+fn sunshine(class: Class, mut random: Random) -> String {
+    const FAR_MM: f64 = 100_000.0;
+    // The sun's radius in the sky.
+    const SUN_RAD: f64 = 0.0047;
+    if !class.has(Class::Visited) || random.unit() < 0.3 {
+        return String::new();
+    }
+    let (azimuth, steep) =
+        (random.between([0.0, std::f64::consts::TAU]), random.between([0.5, 1.2]));
+    let aside_mm = FAR_MM / steep;
+    let way = aside_mm.hypot(FAR_MM);
+    // Of light that comes at a slant, less falls on the belt; the lamp's strength is that right under it.
+    let strength = random.between([0.5, 1.2]) * (way / FAR_MM).powi(3);
+    format!(
+        "[[light.lamp]]\nx_mm = {}\ny_mm = {}\nz_mm = {FAR_MM}\nradius_mm = {}\nstrength = {strength}\n\
+         window = {{ x_mm = {}, y_mm = {}, length_mm = {}, width_mm = {}, yaw_deg = {}, edge_mm = {} }}\n",
+        aside_mm * azimuth.cos(),
+        aside_mm * azimuth.sin(),
+        SUN_RAD * way,
+        random.between([-300.0, 300.0]),
+        random.between([-200.0, 200.0]),
+        random.between([150.0, 500.0]),
+        random.between([80.0, 250.0]),
+        random.between([-90.0, 90.0]),
+        random.between([5.0, 25.0])
+    )
+}
+
+fn noise((class, mut random): (Class, Random)) -> String {
     let read = match class {
         Class::Easy => 0.3,
         _ if class.has(Class::Noisy) => random.between([2.0, 6.0]),
@@ -203,7 +267,7 @@ fn noise(class: Class, random: &mut Random) -> String {
     format!("[noise]\nread_grey = {read}\nelectrons_per_grey = 65\n")
 }
 
-fn sensor(class: Class, random: &mut Random) -> String {
+fn sensor((class, mut random): (Class, Random)) -> String {
     if class == Class::Easy {
         return String::new();
     }
@@ -213,42 +277,32 @@ fn sensor(class: Class, random: &mut Random) -> String {
     let gamma = if random.unit() < 0.5 { 1.0 } else { random.between([0.6, 1.0]) };
     let denoise = if harsh && random.unit() < 0.3 { random.between([0.2, 0.6]) } else { 0.0 };
     let jpeg = if harsh && random.unit() < 0.5 { random.between([50.0, 95.0]) as u8 } else { 0 };
+    let auto = random.unit() < if harsh { 0.5 } else { 0.15 };
+    let auto = if auto { random.between([35.0, 80.0]) } else { 0.0 };
     format!(
         "[sensor]\nblur_px = {blur}\nvibration_px = {vibration}\ngamma = {gamma}\n\
-         denoise = {denoise}\njpeg_quality = {jpeg}\n"
+         denoise = {denoise}\njpeg_quality = {jpeg}\nauto_exposure_grey = {auto}\n\
+         auto_exposure_frames = {}\n",
+        random.between([4.0, 30.0])
     )
 }
 
-/// Parcels, all of them inside the zone's sides, and where the last one begins.
-fn parcels(class: Class, random: &mut Random) -> (String, f64) {
-    let dense = class.has(Class::Dense);
-    let (count, gaps, materials): (usize, [f64; 2], &[&str]) = match class {
-        Class::Easy => (5, [100.0, 200.0], &["kraft", "kraft", "white"]),
-        _ if dense => (8, [10.0, 60.0], &["dark", "dark", "kraft", "printed"]),
-        _ => (5, [70.0, 200.0], &["kraft", "white", "dark", "glossy", "printed"]),
-    };
-    let mut text = String::new();
-    // The first ones of an extreme world lie on the belt in the first frame.
-    let mut end_mm = if class == Class::Extreme { 100.0 } else { -ZONE_HALF_MM[0] - 500.0 };
-    for _ in 0..count {
-        let (a, b) = (random.between([60.0, 300.0]), random.between([60.0, 300.0]));
-        let (l, w) = (a.max(b), a.min(b));
-        let h = random.between([4.0_f64.ln(), 250.0_f64.ln()]).exp().min(1.5 * w);
-        let yaw_deg = random.between([-90.0, 90.0]);
-        let (sin, cos) = yaw_deg.to_radians().sin_cos();
-        let half_x_mm = 0.5 * (l * cos.abs() + w * sin.abs());
-        let room_mm = (ZONE_HALF_MM[1] - 0.5 * (l * sin.abs() + w * cos.abs())).max(0.0);
-        // A parcel's height hides what is behind it.
-        let gap_mm = random.between(gaps) + if dense { 0.1 * h } else { 0.5 * h };
-        let material = materials[(random.unit() * materials.len() as f64) as usize];
-        let _ = writeln!(
-            text,
-            "[[parcel]]\nlength_mm = {l}\nwidth_mm = {w}\nheight_mm = {h}\nyaw_deg = {yaw_deg}\n\
-             x_mm = {}\ny_mm = {}\nmaterial = \"{material}\"",
-            end_mm - half_x_mm,
-            random.between([-room_mm, room_mm])
-        );
-        end_mm -= 2.0 * half_x_mm + gap_mm;
+/// What happens to frames between camera and program.
+fn transport((class, mut random): (Class, Random), seed: u64) -> Faults {
+    if !class.has(Class::Transport) {
+        return Faults::default();
     }
-    (text, end_mm)
+    let mut sometimes = |share: f64, range: [f64; 2]| {
+        let value = random.between(range);
+        if random.unit() < share { value } else { 0.0 }
+    };
+    Faults {
+        drop: sometimes(0.6, [0.01, 0.2]),
+        double: sometimes(0.3, [0.01, 0.1]),
+        swap: sometimes(0.3, [0.01, 0.1]),
+        late_ms: sometimes(0.5, [0.5, 8.0]),
+        noise_grey: 0.0,
+        codec_grey: sometimes(0.6, [4.0, 30.0]),
+        seed,
+    }
 }

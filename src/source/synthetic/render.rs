@@ -1,14 +1,17 @@
-//! Renders clean frames: belt, rails, soft shadows and cuboids with labels and tape.
+//! Renders clean frames: belt, rails, shadows, parcels of all shapes, and what comes in between.
 //!
 //! Every pixel is a ray through the scenario's lens, met with the belt plane once at start.
 //! Edges are sampled 16 times over the pixel and the exposure, which is anti-aliasing and
 //! motion blur at once; plain surfaces are sampled once. The belt's texture is smooth over
 //! several mm, so its own motion blur is left out.
 
-use super::belt::{TEXEL_MM, TILE, texture};
-use super::lamps::{Shadow, hidden_share};
-use super::scenario::{Material, Parcel, Scenario};
-use super::solid::{NOTHING, Solid, TOP};
+use super::belt::{Position, Surface};
+use super::intruder::PlacedRod;
+use super::light::{Hidden, Light};
+use super::parcel::Parcel;
+use super::scenario::Scenario;
+use super::solid::{Hit, Solid};
+use super::surface::NOTHING;
 use crate::camera::{BeltView, Camera};
 use crate::error::Result;
 use crate::units::{BeltPx, RawPx};
@@ -27,15 +30,12 @@ pub struct Renderer {
     centre: [f32; 3],
     /// Point of the belt plane under each pixel; NaN where the ray misses it.
     ground: Vec<[f32; 2]>,
-    tile: Vec<f32>,
+    belt: Surface,
     /// Surface seen by each pixel of the parcel being drawn.
     surface: Vec<u8>,
     /// The parcels in view; room for all of them.
     solids: Vec<Solid>,
-    /// Light on the belt by each lamp, image after image, as a share of full brightness.
-    lamp_light: Vec<f32>,
-    /// Where shadows may lie; room for those of all parcels.
-    shadows: Vec<Shadow>,
+    light: Light,
 }
 
 impl Renderer {
@@ -50,24 +50,16 @@ impl Renderer {
                 camera.belt_point(px).map_or([f32::NAN; 2], |p| [p.x as f32, p.y as f32])
             })
             .collect();
-        let lamps = &scenario.light.lamps;
         let ground: Vec<[f32; 2]> = ground;
-        let lamp_light = lamps
-            .iter()
-            .flat_map(|lamp| {
-                ground.iter().map(|&[x, y]| lamp.irradiance([x, y, 0.0], [0.0, 0.0, 1.0]))
-            })
-            .collect();
-        let shadows = Vec::with_capacity(lamps.len() * scenario.parcels().len());
-        let tile = texture(scenario.seed, scenario.belt.texture_grey);
+        let eye = [centre.x as f32, centre.y as f32, centre.z as f32];
+        let parcels = scenario.parcels().len();
         Ok(Self {
-            solids: Vec::with_capacity(scenario.parcels().len()),
-            lamp_light,
-            shadows,
+            light: Light::new(&scenario.light, eye, &ground, scenario.belt.shine, parcels),
+            belt: Surface::new(scenario.seed, &scenario.belt),
+            solids: Vec::with_capacity(parcels),
             scenario,
-            centre: [centre.x as f32, centre.y as f32, centre.z as f32],
+            centre: eye,
             ground,
-            tile,
             surface: vec![NOTHING; width * height],
             camera,
         })
@@ -91,24 +83,29 @@ impl Renderer {
         let half_exposure_s = 0.5e-3 * self.scenario.exposure_ms;
         let blur_mm = (self.scenario.travel_mm(t_s + half_exposure_s)
             - self.scenario.travel_mm(t_s - half_exposure_s)) as f32;
-        self.render_belt(travel_mm, light, frame);
-        let solids = self.place_solids(travel_mm);
+        let at = Position { travel_mm, aside_mm: self.scenario.aside_mm(t_s) };
+        self.belt.place(at);
+        self.render_belt(light, frame);
+        let solids = self.place_solids(at);
         for solid in &solids {
             self.cast_shadow(solid, frame);
         }
+        self.light.place_shadows(&solids);
         self.cast_lamp_shadows(&solids, frame);
-        for solid in &solids {
-            self.classify(solid);
-            self.draw(solid, light, blur_mm, frame);
+        for n in 0..solids.len() {
+            self.classify(&solids[n]);
+            self.draw(n, &solids, light, blur_mm, frame);
         }
         self.solids = solids;
+        self.draw_intruders(t_s, light, frame);
     }
 
     /// Which pixels of a belt view show a parcel in frame `index`: the true foreground. Row by row;
     /// a pixel is what its centre shows.
     pub fn parcel_mask(&mut self, index: u64, view: &BeltView, mask: &mut [bool]) {
-        let travel_mm = self.scenario.travel_at_frame_mm(index);
-        let solids = self.place_solids(travel_mm);
+        let t_s = index as f64 / self.scenario.fps;
+        let (travel_mm, aside_mm) = (self.scenario.travel_mm(t_s), self.scenario.aside_mm(t_s));
+        let solids = self.place_solids(Position { travel_mm, aside_mm });
         let width = view.size_px[0];
         for (i, shows) in mask.iter_mut().enumerate() {
             let px = BeltPx { u: (i % width) as f64, v: (i / width) as f64 };
@@ -119,25 +116,19 @@ impl Renderer {
         self.solids = solids;
     }
 
-    fn render_belt(&self, travel_mm: f64, light: f32, frame: &mut [u16]) {
-        let belt = &self.scenario.belt;
-        let (grey, half_width) = (belt.grey as f32, 0.5 * belt.width_mm as f32);
-        // The tile repeats, so only the travel within one tile matters.
-        let tile_mm = f64::from(TEXEL_MM) * TILE as f64;
-        let offset_mm = (travel_mm.rem_euclid(tile_mm)) as f32;
-        let pattern = belt.pattern.as_ref();
-        let shift_mm = pattern.map_or(0.0, |p| travel_mm.rem_euclid(p.pitch_mm)) as f32;
+    fn render_belt(&self, light: f32, frame: &mut [u16]) {
+        let half_width = 0.5 * self.scenario.belt.width_mm as f32;
         let px_mm = self.px_mm();
         for (i, (out, &[x, y])) in frame.iter_mut().zip(&self.ground).enumerate() {
-            let surface = if y.abs() <= half_width {
-                let repeated = pattern.map_or(0.0, |p| p.grey(x - shift_mm, y, px_mm));
-                (grey + self.texel(x - offset_mm, y) + repeated).max(0.0)
+            let (surface, shine) = if y.abs() <= half_width {
+                (self.belt.grey([x, y], px_mm), self.light.shine(i))
             } else if y.abs() <= half_width + RAIL_MM {
-                120.0
+                (120.0, 0.0)
             } else {
-                12.0
+                (12.0, 0.0)
             };
-            *out = (surface * self.vignette(x, y) * light * self.lamps_on_belt(i)) as u16;
+            let shade = self.vignette(x, y) * light;
+            *out = (surface * shade * self.light.on_free_belt(i) + shine * shade) as u16;
         }
     }
 
@@ -149,91 +140,17 @@ impl Renderer {
         (a[0] - b[0]).hypot(a[1] - b[1])
     }
 
-    /// Light on the belt at pixel `i` where no parcel is in the way; 1 without lamps.
-    fn lamps_on_belt(&self, i: usize) -> f32 {
-        let light = &self.scenario.light;
-        if light.lamps.is_empty() {
-            return 1.0;
-        }
-        let pixels = self.ground.len();
-        let by_lamps = (0..light.lamps.len()).map(|k| self.lamp_light[k * pixels + i]);
-        light.ambient as f32 + by_lamps.sum::<f32>()
-    }
-
     /// Take away from the belt what the solids hide of the lamps.
-    fn cast_lamp_shadows(&mut self, solids: &[Solid], frame: &mut [u16]) {
-        let lamps = &self.scenario.light.lamps;
-        let mut shadows = std::mem::take(&mut self.shadows);
-        shadows.clear();
-        for (k, lamp) in lamps.iter().enumerate() {
-            let of_lamp = solids.iter().enumerate().map(|(n, s)| Shadow::new(k, lamp, n, s));
-            shadows.extend(of_lamp);
+    fn cast_lamp_shadows(&self, solids: &[Solid], frame: &mut [u16]) {
+        if self.scenario.light.lamps.is_empty() || solids.is_empty() {
+            return;
         }
-        let pixels = self.ground.len();
         for (i, &ground) in self.ground.iter().enumerate() {
-            let mut hidden = 0.0;
-            for (k, lamp) in lamps.iter().enumerate() {
-                let near = shadows.iter().filter(|s| s.lamp == k && s.may_hold(ground));
-                if near.clone().next().is_some() {
-                    let share = hidden_share(lamp, ground, &near, solids);
-                    hidden += share * self.lamp_light[k * pixels + i];
-                }
-            }
-            if hidden > 0.0 {
-                let left = (1.0 - hidden / self.lamps_on_belt(i)).max(0.0);
+            let left = self.light.share_on_belt(i, ground, solids);
+            if left < 1.0 {
                 frame[i] = (f32::from(frame[i]) * left) as u16;
             }
         }
-        self.shadows = shadows;
-    }
-
-    /// Light on the top and the sides of a solid; 1 on the top and the usual shades of the sides
-    /// without lamps.
-    fn light_on(&self, solid: &Solid) -> [f32; 5] {
-        let light = &self.scenario.light;
-        if light.lamps.is_empty() {
-            return [1.0, 0.45, 0.55, 0.5, 0.6];
-        }
-        let [x, y] = solid.centre;
-        let (sin, cos) = (solid.sin, solid.cos);
-        let (a, b) = (solid.half[0], solid.half[1]);
-        let middle = 0.5 * solid.height;
-        let faces = [
-            ([x, y, solid.height], [0.0, 0.0, 1.0], 1.0),
-            ([x - cos * a, y - sin * a, middle], [-cos, -sin, 0.0], 0.5),
-            ([x + cos * a, y + sin * a, middle], [cos, sin, 0.0], 0.5),
-            ([x + sin * b, y - cos * b, middle], [sin, -cos, 0.0], 0.5),
-            ([x - sin * b, y + cos * b, middle], [-sin, cos, 0.0], 0.5),
-        ];
-        faces.map(|(at, normal, sky)| {
-            let by_lamps: f32 = light.lamps.iter().map(|l| l.irradiance(at, normal)).sum();
-            // A side sees half of the sky.
-            light.ambient as f32 * sky + by_lamps
-        })
-    }
-
-    /// Grey levels that the lamps' images add to a glossy top seen over a point of the belt.
-    fn glare(&self, solid: &Solid, ground: [f32; 2]) -> f32 {
-        if solid.parcel.material != Material::Glossy {
-            return 0.0;
-        }
-        let s = 1.0 - solid.height / self.centre[2];
-        let [x, y] = [0, 1].map(|k| self.centre[k] + s * (ground[k] - self.centre[k]));
-        let lamps = self.scenario.light.lamps.iter();
-        lamps.map(|l| l.glare(self.centre, [x, y, solid.height])).sum()
-    }
-
-    /// Bilinear texture at a point of the belt.
-    fn texel(&self, x_mm: f32, y_mm: f32) -> f32 {
-        // Far enough from 0 that truncation is floor.
-        let shift = (64 * TILE) as f32;
-        let (u, v) = (x_mm / TEXEL_MM + shift, y_mm / TEXEL_MM + shift);
-        let (iu, iv) = (u as usize, v as usize);
-        let (fu, fv) = (u - iu as f32, v - iv as f32);
-        let at = |u: usize, v: usize| self.tile[(v % TILE) * TILE + u % TILE];
-        let top = at(iu, iv) * (1.0 - fu) + at(iu + 1, iv) * fu;
-        let bottom = at(iu, iv + 1) * (1.0 - fu) + at(iu + 1, iv + 1) * fu;
-        top * (1.0 - fv) + bottom * fv
     }
 
     fn vignette(&self, x: f32, y: f32) -> f32 {
@@ -243,19 +160,19 @@ impl Renderer {
 
     /// The parcels in view, furthest from the nadir first: nearer ones lean over them. The list
     /// is lent, so that rendering allocates nothing.
-    fn place_solids(&mut self, travel_mm: f64) -> Vec<Solid> {
+    fn place_solids(&mut self, at: Position) -> Vec<Solid> {
         let mut solids = std::mem::take(&mut self.solids);
         solids.clear();
-        solids.extend(self.scenario.parcels().iter().filter_map(|p| self.solid(p, travel_mm)));
+        solids.extend(self.scenario.parcels().iter().filter_map(|p| self.solid(p, at)));
         let distance =
             |s: &Solid| (s.centre[0] - self.centre[0]).hypot(s.centre[1] - self.centre[1]);
         solids.sort_unstable_by(|a, b| distance(b).total_cmp(&distance(a)));
         solids
     }
 
-    fn solid(&self, parcel: &Parcel, travel_mm: f64) -> Option<Solid> {
-        let (sin, cos) = parcel.yaw_deg.to_radians().sin_cos();
-        let x_mm = parcel.x_mm + travel_mm;
+    fn solid(&self, parcel: &Parcel, at: Position) -> Option<Solid> {
+        let place = parcel.place(at.travel_mm, at.aside_mm);
+        let (sin, cos) = place.yaw_deg.to_radians().sin_cos();
         // Room for shadow and blur around the solid itself.
         let margin_mm = shadow_reach_mm(parcel.height_mm as f32) as f64 + 5.0;
         let mut bounds = [f64::INFINITY, f64::NEG_INFINITY, f64::INFINITY, f64::NEG_INFINITY];
@@ -264,7 +181,8 @@ impl Renderer {
             let z = if k & 4 == 4 { parcel.height_mm } else { 0.0 };
             let a = sign(0) * (0.5 * parcel.length_mm + margin_mm);
             let b = sign(1) * (0.5 * parcel.width_mm + margin_mm);
-            let at = Vector3::new(x_mm + cos * a - sin * b, parcel.y_mm + sin * a + cos * b, z);
+            let at =
+                Vector3::new(place.x_mm + cos * a - sin * b, place.y_mm + sin * a + cos * b, z);
             let px = self.camera.project(at)?;
             bounds = [
                 bounds[0].min(px.x),
@@ -285,19 +203,17 @@ impl Renderer {
         if bounds[0] >= bounds[1] || bounds[2] >= bounds[3] {
             return None;
         }
-        let mut solid = Solid {
+        Some(Solid {
             parcel: *parcel,
             radius: self.scenario.edge_radius_mm.min(0.45 * parcel.height_mm) as f32,
-            centre: [x_mm as f32, parcel.y_mm as f32],
+            centre: [place.x_mm as f32, place.y_mm as f32],
             sin: sin as f32,
             cos: cos as f32,
             half: [0.5 * parcel.length_mm as f32, 0.5 * parcel.width_mm as f32],
             height: parcel.height_mm as f32,
-            light: [1.0; 5],
+            shades: self.light.shades(),
             bounds,
-        };
-        solid.light = self.light_on(&solid);
-        Some(solid)
+        })
     }
 
     /// Darken the belt around a footprint, less and less with the distance.
@@ -323,11 +239,13 @@ impl Renderer {
         let width = self.camera.image_size_px[0];
         for i in (v0..v1).flat_map(|v| v * width + u0..v * width + u1) {
             self.surface[i] =
-                solid.meet(self.centre, self.ground[i], 0.0).map_or(NOTHING, |hit| hit.surface);
+                solid.meet(self.centre, self.ground[i], 0.0).map_or(NOTHING, |hit| hit.surface.id);
         }
     }
 
-    fn draw(&self, solid: &Solid, light: f32, blur_mm: f32, frame: &mut [u16]) {
+    /// Draw solid `n` of those in view.
+    fn draw(&self, n: usize, solids: &[Solid], light: f32, blur_mm: f32, frame: &mut [u16]) {
+        let solid = &solids[n];
         let [u0, u1, v0, v1] = solid.bounds;
         let width = self.camera.image_size_px[0];
         // The outermost pixels were given a margin and show nothing.
@@ -342,25 +260,45 @@ impl Renderer {
                 }
                 let ground = self.ground[i];
                 let shade = self.vignette(ground[0], ground[1]) * light;
-                let sampled = if plain {
-                    solid.meet(self.centre, ground, 0.0).map(|hit| hit.grey * shade)
+                let hidden = |hit: &Hit| self.light.hidden(solid.in_belt(hit).0, Some(n), solids);
+                let centre = solid.meet(self.centre, ground, 0.0).map(|hit| (hit, hidden(&hit)));
+                let value = if plain {
+                    centre.map(|(hit, hidden)| self.radiance(solid, &hit, &hidden) * shade)
                 } else {
-                    Some(self.supersample(solid, i, shade, blur_mm, f32::from(frame[i])))
+                    let (behind, known) = (f32::from(frame[i]), centre.map(|(_, hidden)| hidden));
+                    let hidden = |hit: &Hit| known.unwrap_or_else(|| hidden(hit));
+                    Some(self.supersample(solid, i, shade, blur_mm, behind, hidden))
                 };
-                if let Some(value) = sampled {
-                    let glare = if here == TOP { self.glare(solid, ground) * shade } else { 0.0 };
-                    frame[i] = (value + glare) as u16;
+                if let Some(value) = value {
+                    let glare = centre.map_or(0.0, |(hit, hidden)| {
+                        self.light.glare(self.centre, solid, &hit, &hidden) * shade
+                    });
+                    frame[i] = (value + glare).min(65535.0) as u16;
                 }
             }
         }
     }
 
-    /// Mean over the pixel's area and the exposure; `behind` shows where the solid does not.
-    fn supersample(&self, solid: &Solid, i: usize, shade: f32, blur_mm: f32, behind: f32) -> f32 {
+    fn radiance(&self, solid: &Solid, hit: &Hit, hidden: &Hidden) -> f32 {
+        hit.surface.grey * self.light.on_parcel(solid, hit, hidden)
+    }
+
+    /// Mean over the pixel's area and the exposure; `behind` shows where the solid does not. What is
+    /// hidden of the lamps is the same all over a pixel.
+    fn supersample(
+        &self,
+        solid: &Solid,
+        i: usize,
+        shade: f32,
+        blur_mm: f32,
+        behind: f32,
+        hidden_at: impl Fn(&Hit) -> Hidden,
+    ) -> f32 {
         let width = self.camera.image_size_px[0];
         let difference =
             |a: usize, b: usize| [0, 1].map(|k| 0.5 * (self.ground[a][k] - self.ground[b][k]));
         let (du, dv) = (difference(i + 1, i - 1), difference(i + width, i - width));
+        let mut hidden = None;
         let mut sum = 0.0;
         for k in 0..SUB * SUB {
             let place = |n: usize| (n as f32 + 0.5) / SUB as f32 - 0.5;
@@ -368,11 +306,29 @@ impl Renderer {
             let ground = [0, 1].map(|c| self.ground[i][c] + a * du[c] + b * dv[c]);
             // 7 is coprime to 16: times are spread evenly over every row and column.
             let time = ((k * 7 % (SUB * SUB)) as f32 + 0.5) / (SUB * SUB) as f32 - 0.5;
-            sum += solid
-                .meet_rounded(self.centre, ground, time * blur_mm)
-                .map_or(behind, |grey| grey * shade);
+            sum += solid.meet_rounded(self.centre, ground, time * blur_mm).map_or(behind, |hit| {
+                let hidden = hidden.get_or_insert_with(|| hidden_at(&hit));
+                self.radiance(solid, &hit, hidden) * shade
+            });
         }
         sum / (SUB * SUB) as f32
+    }
+
+    /// Draw hands, sleeves and cables over everything: they are above what rides.
+    fn draw_intruders(&self, t_s: f64, light: f32, frame: &mut [u16]) {
+        let eye = Vector3::from(self.centre.map(f64::from));
+        let px_rad = f64::from(self.px_mm() / self.centre[2]);
+        for intruder in &self.scenario.intruders {
+            let Some(moved_mm) = intruder.moved_mm(t_s) else { continue };
+            for rod in intruder.rods.iter().map(|rod| PlacedRod::new(*rod, moved_mm)) {
+                for (out, &[x, y]) in frame.iter_mut().zip(&self.ground) {
+                    let ray = Vector3::new(f64::from(x), f64::from(y), 0.0) - eye;
+                    let Some([cover, grey]) = rod.cover(eye, ray, px_rad) else { continue };
+                    let grey = grey * f64::from(self.vignette(x, y) * light);
+                    *out = (f64::from(*out) * (1.0 - cover) + cover * grey) as u16;
+                }
+            }
+        }
     }
 }
 

@@ -1,7 +1,10 @@
 //! The scenario file: everything about a synthetic sequence, and nothing twice.
 
 use super::belt::PatternTable;
-use super::lamps::Lamp;
+use super::intruder::Intruder;
+use super::lamps::{LAMPS_MAX, Lamp};
+use super::marks::{DirtTable, Mark};
+use super::parcel::{Parcel, Place, RandomTable};
 use super::random::Random;
 use super::sensor::SensorTable;
 use crate::camera::{Camera, CameraFile};
@@ -44,6 +47,9 @@ pub struct Scenario {
     parcels: Vec<Parcel>,
     /// Parcels drawn at random, after those.
     random: Option<RandomTable>,
+    /// What comes into the picture and does not ride.
+    #[serde(default, rename = "intruder")]
+    pub(super) intruders: Vec<Intruder>,
 }
 
 /// A carton's.
@@ -74,6 +80,24 @@ pub struct BeltTable {
     /// Stops, in order of time.
     #[serde(default, rename = "stop")]
     pub stops: Vec<StopTable>,
+    /// It wanders to its side by so much.
+    #[serde(default)]
+    pub side_drift_mm: f64,
+    /// Period of that.
+    #[serde(default = "side_drift_period_s")]
+    pub side_drift_period_s: f64,
+    /// How much of a lamp's image it throws back, 0 to 1.
+    #[serde(default)]
+    pub shine: f64,
+    /// Flat things on it, one by one.
+    #[serde(default, rename = "mark")]
+    pub marks: Vec<Mark>,
+    /// Spots drawn at random.
+    pub dirt: Option<DirtTable>,
+}
+
+fn side_drift_period_s() -> f64 {
+    5.0
 }
 
 fn ripple_period_s() -> f64 {
@@ -90,6 +114,9 @@ pub struct StopTable {
     pub for_s: f64,
     /// Slowing down takes this long, starting the same.
     pub ramp_s: f64,
+    /// Creeps back by so much while it stands.
+    #[serde(default)]
+    pub back_mm: f64,
 }
 
 /// `[light]`
@@ -157,57 +184,6 @@ impl Default for NoiseTable {
     }
 }
 
-/// What a parcel is made of.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, Deserialize)]
-#[serde(rename_all = "lowercase")]
-pub enum Material {
-    /// Brown cardboard with tape.
-    Kraft,
-    /// White cardboard.
-    White,
-    /// Black, with a label.
-    Dark,
-    /// White under a film that mirrors the lamps.
-    Glossy,
-    /// Printed all over.
-    Printed,
-}
-
-/// `[[parcel]]`: a cuboid on the belt.
-#[derive(Clone, Copy, Debug, Deserialize)]
-#[serde(deny_unknown_fields)]
-pub struct Parcel {
-    /// Longer side of the footprint.
-    pub length_mm: f64,
-    /// Shorter side of the footprint.
-    pub width_mm: f64,
-    /// Height.
-    pub height_mm: f64,
-    /// Length axis against +X.
-    pub yaw_deg: f64,
-    /// Footprint centre before the belt has moved.
-    pub x_mm: f64,
-    /// Footprint centre across the belt.
-    pub y_mm: f64,
-    /// Surface.
-    pub material: Material,
-}
-
-/// `[random]`: parcels one behind the other.
-#[derive(Clone, Debug, Deserialize)]
-#[serde(deny_unknown_fields)]
-pub struct RandomTable {
-    count: usize,
-    /// Centre of the first one before the belt has moved.
-    first_x_mm: f64,
-    /// Free belt between neighbours, along travel.
-    gap_mm: [f64; 2],
-    y_mm: [f64; 2],
-    length_mm: [f64; 2],
-    width_mm: [f64; 2],
-    height_mm: [f64; 2],
-}
-
 impl Scenario {
     /// Parse and check.
     pub fn parse(text: &str) -> Result<Self> {
@@ -220,15 +196,22 @@ impl Scenario {
             && belt.ripple.abs() < 1.0
             && belt.ripple_period_s > 0.0
             && belt.pattern.is_none_or(|p| p.pitch_mm > 0.0)
-            && belt.stops.iter().all(|s| s.at_s >= 0.0 && s.for_s >= 0.0 && s.ramp_s > 0.0)
+            && belt.stops.iter().all(StopTable::is_usable)
+            && belt.side_drift_period_s > 0.0
+            && (0.0..=1.0).contains(&belt.shine)
+            && belt.marks.iter().all(Mark::is_usable)
+            && belt.dirt.is_none_or(|dirt| dirt.is_usable())
+            && scenario.intruders.iter().all(Intruder::is_usable)
             && scenario.sensor.is_usable()
-            && scenario.light.lamps.iter().all(|l| l.radius_mm >= 0.0 && l.strength >= 0.0)
-            && scenario.parcels.iter().all(|p| p.length_mm >= p.width_mm && p.height_mm > 0.0);
+            && scenario.light.lamps.len() <= LAMPS_MAX
+            && scenario.light.lamps.iter().all(Lamp::is_usable)
+            && scenario.parcels.iter().all(Parcel::is_usable);
         if !usable {
             return Err(Error::configuration("the scenario cannot be rendered").allowed(
-                "fps, speed and ramp_s above 0, stops not negative, length >= width, height above 0, \
-                 ripple below 1, periods and pitch above 0, lamps above every parcel, blur_px 0 to 2.5, vibration_px \
-                 0 to 1, gamma 0.3 to 3, denoise 0 to 0.9, jpeg_quality 0 to 100",
+                "fps, speed and ramp_s above 0, stops not negative, length >= width, width and height above 0, \
+                 ripple below 1, periods, pitch and radii above 0, up to 8 lamps above every parcel, blur_px 0 to \
+                 2.5, vibration_px 0 to 1, gamma 0.3 to 3, denoise 0 to 0.9, jpeg_quality 0 to 100, shine, cover and \
+                 wrap 0 to 1, straps 0 to 4, slide up to 0.2, turn_deg_per_m up to 90, up to 2000 spots a square metre",
             ));
         }
         if let Some(random) = scenario.random.take() {
@@ -261,9 +244,22 @@ impl Scenario {
     pub fn travel_mm(&self, t_s: f64) -> f64 {
         let lost_s: f64 = self.belt.stops.iter().map(|s| s.lost_s(t_s)).sum();
         let run_s = t_s - lost_s;
+        let back_mm: f64 = self.belt.stops.iter().map(|s| s.gone_back_mm(t_s)).sum();
         let pulse = std::f64::consts::TAU / self.belt.ripple_period_s;
         let ahead_s = self.belt.ripple * (1.0 - (pulse * run_s).cos()) / pulse;
-        self.belt.speed_mm_per_s * (run_s + ahead_s)
+        self.belt.speed_mm_per_s * (run_s + ahead_s) - back_mm
+    }
+
+    /// How far the belt has wandered to its side at a time, mm.
+    pub fn aside_mm(&self, t_s: f64) -> f64 {
+        let phase = std::f64::consts::TAU * t_s / self.belt.side_drift_period_s;
+        self.belt.side_drift_mm * phase.sin()
+    }
+
+    /// Where a parcel is in the middle of a frame's exposure.
+    pub fn place_at_frame(&self, parcel: &Parcel, index: u64) -> Place {
+        let t_s = index as f64 / self.fps;
+        parcel.place(self.travel_mm(t_s), self.aside_mm(t_s))
     }
 
     /// Belt travel in the middle of a frame's exposure.
@@ -283,6 +279,17 @@ impl Scenario {
 }
 
 impl StopTable {
+    fn is_usable(&self) -> bool {
+        self.at_s >= 0.0 && self.for_s >= 0.0 && self.ramp_s > 0.0 && self.back_mm >= 0.0
+    }
+
+    /// How far it has crept back until `t_s`: gently from standstill to standstill.
+    fn gone_back_mm(&self, t_s: f64) -> f64 {
+        let stands_s = t_s - self.at_s - self.ramp_s;
+        let share = (stands_s / self.for_s.max(f64::MIN_POSITIVE)).clamp(0.0, 1.0);
+        self.back_mm * share * share * (3.0 - 2.0 * share)
+    }
+
     /// Running time lost to the stop until `t_s`: the integral of the missing speed.
     fn lost_s(&self, t_s: f64) -> f64 {
         let ramp = |since_s: f64| {
@@ -291,41 +298,6 @@ impl StopTable {
         };
         // The speed that is missing rises in one ramp and falls again in the other.
         ramp(t_s - self.at_s) - ramp(t_s - self.at_s - self.ramp_s - self.for_s)
-    }
-}
-
-impl RandomTable {
-    fn draw(&self, random: &mut Random) -> Vec<Parcel> {
-        let mut end_mm = self.first_x_mm;
-        let mut parcels = Vec::with_capacity(self.count);
-        for i in 0..self.count {
-            let (a, b) = (random.between(self.length_mm), random.between(self.width_mm));
-            let (length_mm, width_mm) = (a.max(b), a.min(b));
-            let yaw_deg = random.between([-90.0, 90.0]);
-            let (sin, cos) = yaw_deg.to_radians().sin_cos();
-            let half_mm = 0.5 * (length_mm * cos.abs() + width_mm * sin.abs());
-            if i > 0 {
-                end_mm -= random.between(self.gap_mm) + half_mm;
-            }
-            let material = match random.bits() % 5 {
-                0 => Material::Dark,
-                1 => Material::White,
-                _ => Material::Kraft,
-            };
-            let height_mm = random.between(self.height_mm);
-            let y_mm = random.between(self.y_mm);
-            parcels.push(Parcel {
-                length_mm,
-                width_mm,
-                height_mm,
-                yaw_deg,
-                x_mm: end_mm,
-                y_mm,
-                material,
-            });
-            end_mm -= half_mm;
-        }
-        parcels
     }
 }
 
@@ -346,10 +318,13 @@ mod tests {
 
     #[test]
     fn a_stop_costs_its_standstill_and_one_ramp() {
-        let stop = StopTable { at_s: 2.0, for_s: 3.0, ramp_s: 0.5 };
+        let stop = StopTable { at_s: 2.0, for_s: 3.0, ramp_s: 0.5, back_mm: 12.0 };
         assert!(stop.lost_s(2.0).abs() < 1e-12);
         assert!((stop.lost_s(100.0) - 3.5).abs() < 1e-12);
         // Standing still: all time is lost.
         assert!((stop.lost_s(5.0) - stop.lost_s(3.0) - 2.0).abs() < 1e-12);
+        // It creeps back while it stands, and only then.
+        let gone = [2.5, 4.0, 5.5, 9.0].map(|t_s| stop.gone_back_mm(t_s));
+        assert_eq!(gone.map(|mm| mm.round() as i32), [0, 6, 12, 12]);
     }
 }

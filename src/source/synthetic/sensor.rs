@@ -19,13 +19,25 @@ pub struct SensorTable {
     pub gamma: f64,
     /// Share of the frame before that a noise reduction leaves in this one, 0 to 0.9.
     pub denoise: f64,
+    /// Mean grey level that the automatic exposure holds the picture at; 0: it is off.
+    pub auto_exposure_grey: f64,
+    /// How many frames it takes for most of the way there.
+    pub auto_exposure_frames: f64,
     /// Quality of a JPEG between camera and program, 1 to 100; 0: none.
     pub jpeg_quality: u8,
 }
 
 impl Default for SensorTable {
     fn default() -> Self {
-        Self { blur_px: 0.0, vibration_px: 0.0, gamma: 1.0, denoise: 0.0, jpeg_quality: 0 }
+        Self {
+            blur_px: 0.0,
+            vibration_px: 0.0,
+            gamma: 1.0,
+            denoise: 0.0,
+            auto_exposure_grey: 0.0,
+            auto_exposure_frames: 10.0,
+            jpeg_quality: 0,
+        }
     }
 }
 
@@ -36,6 +48,8 @@ impl SensorTable {
             && (0.0..=1.0).contains(&self.vibration_px)
             && (0.3..=3.0).contains(&self.gamma)
             && (0.0..=0.9).contains(&self.denoise)
+            && (0.0..=200.0).contains(&self.auto_exposure_grey)
+            && self.auto_exposure_frames >= 1.0
             && self.jpeg_quality <= 100
     }
 }
@@ -51,6 +65,8 @@ pub(super) struct Sensor {
     /// The frame that went out last, and its index.
     before: Vec<u8>,
     before_index: Option<u64>,
+    /// Of the automatic exposure.
+    gain: Option<f64>,
 }
 
 impl Sensor {
@@ -64,14 +80,32 @@ impl Sensor {
             curve: if linear { Vec::new() } else { (0..65536).map(bent).collect() },
             before: vec![0; if table.denoise > 0.0 { bytes } else { 0 }],
             before_index: None,
+            gain: None,
             table: table.clone(),
             seed,
             size_px,
         }
     }
 
-    /// Blur, vibration and gamma of a clean frame, 1/256 grey levels.
+    /// The automatic exposure: this frame with the gain that the frames before it led to. It remembers
+    /// them: frames in order only.
+    fn hold_brightness(&mut self, clean: &mut [u16]) {
+        let sum: u64 = clean.iter().map(|grey| u64::from(*grey)).sum();
+        let mean_grey = sum as f64 / 256.0 / clean.len().max(1) as f64;
+        let wanted = (self.table.auto_exposure_grey / mean_grey.max(1.0)).clamp(0.25, 4.0);
+        let gain = *self.gain.get_or_insert(wanted);
+        for grey in clean {
+            *grey = (f64::from(*grey) * gain).min(65535.0) as u16;
+        }
+        let share = 1.0 - (-1.0 / self.table.auto_exposure_frames).exp();
+        self.gain = Some(gain * (wanted / gain).powf(share));
+    }
+
+    /// Exposure, blur, vibration and gamma of a clean frame, 1/256 grey levels.
     pub(super) fn expose(&mut self, index: u64, clean: &mut [u16]) {
+        if self.table.auto_exposure_grey > 0.0 {
+            self.hold_brightness(clean);
+        }
         let width = self.size_px[0];
         if !self.scratch.is_empty() {
             let mut random = Random(self.seed ^ 0x7669_6272 ^ index.wrapping_mul(0x9e37_79b9));

@@ -1,13 +1,7 @@
 //! A parcel in one frame: how rays meet it and what they see.
 
-use super::scenario::{Material, Parcel};
-
-/// No parcel surface.
-pub(super) const NOTHING: u8 = 0;
-/// The top, where nothing is stuck or printed on it.
-pub(super) const TOP: u8 = 1;
-/// The first of the inks.
-const PRINT: u8 = 16;
+use super::parcel::Parcel;
+use super::surface::{self, INSIDE, Surface};
 
 /// A parcel in one frame, ready to be met by rays.
 pub(super) struct Solid {
@@ -19,16 +13,18 @@ pub(super) struct Solid {
     pub(super) cos: f32,
     pub(super) half: [f32; 2],
     pub(super) height: f32,
-    /// Light on its top and on its four sides.
-    pub(super) light: [f32; 5],
+    /// Shades of its top and its four sides where there are no lamps.
+    pub(super) shades: [f32; 5],
     /// Pixels it may cover: first and one past last column and row.
     pub(super) bounds: [usize; 4],
 }
 
-/// Where a ray meets a solid: surface identity and grey level.
+/// Where a ray meets a solid: place and outward direction in the solid's own axes, and what is there.
+#[derive(Clone, Copy)]
 pub(super) struct Hit {
-    pub(super) surface: u8,
-    pub(super) grey: f32,
+    pub(super) at: [f32; 3],
+    pub(super) normal: [f32; 3],
+    pub(super) surface: Surface,
 }
 
 /// A ray through a solid; its places are `from + s * along`.
@@ -47,6 +43,11 @@ impl Crossing {
     }
 }
 
+/// Outward direction of a face.
+fn outward(face: usize) -> [f32; 3] {
+    [[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [1.0, 0.0, 0.0], [0.0, -1.0, 0.0], [0.0, 1.0, 0.0]][face]
+}
+
 impl Solid {
     /// The corners of the top, along and across the belt.
     pub(super) fn corners(&self) -> [[f32; 2]; 4] {
@@ -63,21 +64,25 @@ impl Solid {
         [self.cos * dx + self.sin * dy, self.cos * dy - self.sin * dx]
     }
 
-    /// The ray from the camera to `ground`, in the axes of the solid moved by `shift_mm`, and the
-    /// part of it that is in the cuboid with sharp edges, from the face it enters by.
-    pub(super) fn cross(
-        &self,
-        camera: [f32; 3],
-        ground: [f32; 2],
-        shift_mm: f32,
-    ) -> Option<Crossing> {
-        let from = self.local([camera[0] - shift_mm, camera[1]]);
-        let to = self.local([ground[0] - shift_mm, ground[1]]);
-        // Slab method; s runs from the camera (0) to the belt (1). Source: Kay and Kajiya 1986.
-        let (mut enter, mut leave, mut face) = (1.0 - self.height / camera[2], 1.0, 0);
+    /// A point and a direction of the parcel's own axes in those of the belt.
+    pub(super) fn in_belt(&self, hit: &Hit) -> ([f32; 3], [f32; 3]) {
+        let turned =
+            |[a, b, z]: [f32; 3]| [self.cos * a - self.sin * b, self.sin * a + self.cos * b, z];
+        let [x, y, z] = turned(hit.at);
+        ([self.centre[0] + x, self.centre[1] + y, z], turned(hit.normal))
+    }
+
+    /// The way from a point above all solids to another, in the axes of the solid moved by `shift_mm`,
+    /// and the part of it that is in the cuboid with sharp edges, from the face it enters by.
+    pub(super) fn cross(&self, from: [f32; 3], to: [f32; 3], shift_mm: f32) -> Option<Crossing> {
+        let start = self.local([from[0] - shift_mm, from[1]]);
+        let end = self.local([to[0] - shift_mm, to[1]]);
+        // Slab method; s runs from the one point (0) to the other (1). Source: Kay and Kajiya 1986.
+        let drop = from[2] - to[2];
+        let (mut enter, mut leave, mut face) = (1.0 - (self.height - to[2]) / drop, 1.0, 0);
         for axis in 0..2 {
-            let along = to[axis] - from[axis];
-            let at = |plane: f32| (plane - from[axis]) / along;
+            let along = end[axis] - start[axis];
+            let at = |plane: f32| (plane - start[axis]) / along;
             let (near, far) = if along > 0.0 {
                 (at(-self.half[axis]), at(self.half[axis]))
             } else {
@@ -92,43 +97,50 @@ impl Solid {
         // A ray that misses the belt is NaN, and so is everything met by it.
         let hit = enter.partial_cmp(&leave) == Some(std::cmp::Ordering::Less);
         hit.then_some(Crossing {
-            from: [from[0], from[1], camera[2]],
-            along: [to[0] - from[0], to[1] - from[1], -camera[2]],
+            from: [start[0], start[1], from[2]],
+            along: [end[0] - start[0], end[1] - start[1], -drop],
             enter,
             leave,
             face,
         })
     }
 
-    /// Where a ray meets the solid as if its edges were sharp.
-    pub(super) fn meet(&self, camera: [f32; 3], ground: [f32; 2], shift_mm: f32) -> Option<Hit> {
-        let ray = self.cross(camera, ground, shift_mm)?;
-        Some(self.shade_sharp(&ray, ray.at(ray.enter)))
+    /// Whether it is in the way from a point above it to another.
+    pub(super) fn hides(&self, from: [f32; 3], to: [f32; 3]) -> bool {
+        self.cross(from, to, 0.0)
+            .is_some_and(|ray| self.parcel.shape.is_box() || self.reaches(&ray))
     }
 
-    fn shade_sharp(&self, ray: &Crossing, [a, b, z]: [f32; 3]) -> Hit {
-        if ray.face == 0 { self.top([a, b]) } else { self.side(ray.face, z) }
+    /// Where the camera's ray to a point of the belt meets the solid, as if its edges were sharp.
+    pub(super) fn meet(&self, camera: [f32; 3], [x, y]: [f32; 2], shift_mm: f32) -> Option<Hit> {
+        let ray = self.cross(camera, [x, y, 0.0], shift_mm)?;
+        if self.parcel.shape.is_box() { Some(self.sharp(&ray)) } else { self.march(&ray) }
     }
 
-    /// Grey level where a ray meets the solid with its rounded edges: sphere tracing (Hart 1996)
-    /// from the sharp cuboid's surface on. Radiance goes from the top's to the side's with
-    /// the cosine of the normal's tilt, as under diffuse light.
+    fn sharp(&self, ray: &Crossing) -> Hit {
+        let at @ [a, b, z] = ray.at(ray.enter);
+        let surface = if ray.face == 0 { self.top([a, b]) } else { self.side(ray.face, a, z) };
+        Hit { at, normal: outward(ray.face), surface }
+    }
+
+    /// Where a ray meets the solid with its rounded edges: sphere tracing (Hart 1996) from the sharp
+    /// cuboid's surface on.
     pub(super) fn meet_rounded(
         &self,
         camera: [f32; 3],
-        ground: [f32; 2],
+        [x, y]: [f32; 2],
         shift_mm: f32,
-    ) -> Option<f32> {
+    ) -> Option<Hit> {
         const NEAR_MM: f32 = 0.02;
         const STEPS: usize = 16;
-        let ray = self.cross(camera, ground, shift_mm)?;
-        let [a, b, z] = ray.at(ray.enter);
-        let core = |k: usize, at: f32| at.abs() <= self.half[k] - self.radius;
-        if ray.face == 0 && core(0, a) && core(1, b) {
-            return Some(self.top([a, b]).grey);
+        let ray = self.cross(camera, [x, y, 0.0], shift_mm)?;
+        if !self.parcel.shape.is_box() {
+            return self.march(&ray);
         }
-        if self.radius == 0.0 {
-            return Some(self.shade_sharp(&ray, [a, b, z]).grey);
+        let [a, b, _] = ray.at(ray.enter);
+        let core = |k: usize, at: f32| at.abs() <= self.half[k] - self.radius;
+        if self.radius == 0.0 || ray.face == 0 && core(0, a) && core(1, b) {
+            return Some(self.sharp(&ray));
         }
         let length = ray.along.iter().map(|a| a * a).sum::<f32>().sqrt();
         let mut s = ray.enter;
@@ -144,7 +156,8 @@ impl Solid {
             let distance = outside.iter().map(|c| c * c).sum::<f32>().sqrt() - self.radius
                 + core[0].max(core[1]).max(core[2]).min(0.0);
             if distance < NEAR_MM {
-                return Some(self.shade(p, outside));
+                let normal = [outside[0].copysign(p[0]), outside[1].copysign(p[1]), outside[2]];
+                return Some(self.curved(p, normal));
             }
             s += distance / length;
             if s > ray.leave {
@@ -154,64 +167,89 @@ impl Solid {
         None
     }
 
-    /// Grey level at a point of the surface whose normal has the direction `normal` in the
-    /// octant of the point.
-    fn shade(&self, [a, b, z]: [f32; 3], normal: [f32; 3]) -> f32 {
+    /// Whether a ray meets a solid of another shape, to a mm: shadows are no sharper.
+    fn reaches(&self, ray: &Crossing) -> bool {
+        const NEAR_MM: f32 = 1.0;
+        const STEPS: usize = 24;
+        let length = ray.along.iter().map(|a| a * a).sum::<f32>().sqrt();
+        let mut s = ray.enter;
+        for _ in 0..STEPS {
+            let distance = self.parcel.shape.distance(ray.at(s), self.half, self.height);
+            if distance < NEAR_MM {
+                return true;
+            }
+            s += distance / length;
+            if s > ray.leave {
+                return false;
+            }
+        }
+        false
+    }
+
+    /// Where a ray meets a solid of another shape: sphere tracing through its cuboid.
+    fn march(&self, ray: &Crossing) -> Option<Hit> {
+        const NEAR_MM: f32 = 0.05;
+        const STEPS: usize = 96;
+        let length = ray.along.iter().map(|a| a * a).sum::<f32>().sqrt();
+        let shape = self.parcel.shape;
+        let mut s = ray.enter;
+        for _ in 0..STEPS {
+            let at = ray.at(s);
+            let distance = shape.distance(at, self.half, self.height);
+            if distance < NEAR_MM {
+                let mut hit = self.curved(at, shape.normal(at, self.half, self.height));
+                let open = shape.openness(at, self.half, self.height);
+                if open < 1.0 {
+                    hit.surface.id += INSIDE;
+                    hit.surface.grey *= open;
+                }
+                return Some(hit);
+            }
+            s += distance / length;
+            if s > ray.leave {
+                return None;
+            }
+        }
+        None
+    }
+
+    /// What is at a point of the surface with an outward direction of any length. Radiance goes from
+    /// the top's to the side's with the cosine of its tilt, as under diffuse light.
+    fn curved(&self, at: [f32; 3], normal: [f32; 3]) -> Hit {
+        let [a, b, z] = at;
         let [x2, y2, z2] = normal.map(|n| n * n);
-        let top = || self.top([a, b]).grey;
         if x2 + y2 == 0.0 {
-            return top();
+            return Hit { at, normal: [0.0, 0.0, 1.0], surface: self.top([a, b]) };
         }
-        let side_x = || self.side(1 + usize::from(a > 0.0), z).grey;
-        let side_y = || self.side(3 + usize::from(b > 0.0), z).grey;
-        let side = (x2 * side_x() + y2 * side_y()) / (x2 + y2);
+        let side_x = self.side(1 + usize::from(normal[0] > 0.0), a, z);
+        let side_y = self.side(3 + usize::from(normal[1] > 0.0), a, z);
+        let side_grey = (x2 * side_x.grey + y2 * side_y.grey) / (x2 + y2);
         let cosine = (z2 / (x2 + y2 + z2)).sqrt();
-        if cosine == 0.0 { side } else { side + cosine * (top() - side) }
+        let length = (x2 + y2 + z2).sqrt();
+        let normal = normal.map(|n| n / length);
+        // What hangs over sees the belt only.
+        if cosine == 0.0 || normal[2] < 0.0 {
+            let id = if x2 > y2 { side_x.id } else { side_y.id };
+            return Hit { at, normal, surface: Surface { id, grey: side_grey } };
+        }
+        let top = self.top([a, b]);
+        let grey = side_grey + cosine * (top.grey - side_grey);
+        let id = if cosine > 0.5 {
+            top.id
+        } else if x2 > y2 {
+            side_x.id
+        } else {
+            side_y.id
+        };
+        Hit { at, normal, surface: Surface { id, grey } }
     }
 
-    /// Grey level of the bare surface in full light.
-    fn plain_grey(&self) -> f32 {
-        match self.parcel.material {
-            Material::Kraft => 105.0,
-            Material::White | Material::Printed => 190.0,
-            Material::Glossy => 150.0,
-            Material::Dark => 20.0,
-        }
+    fn top(&self, at: [f32; 2]) -> Surface {
+        let surface = surface::top(&self.parcel, self.half, at);
+        Surface { grey: surface.grey * self.shades[0], ..surface }
     }
 
-    /// Top face: plain, tape along the middle, label with bars.
-    fn top(&self, [a, b]: [f32; 2]) -> Hit {
-        let light = self.light[0];
-        let plain = self.plain_grey() * light;
-        // A label in one quarter, up to 80 x 50 mm.
-        let label = [(0.4 * self.half[0]).min(40.0), (0.4 * self.half[1]).min(25.0)];
-        let (la, lb) = (a + 0.45 * self.half[0], b - 0.4 * self.half[1]);
-        if la.abs() < label[0] && lb.abs() < label[1] {
-            let bar = lb < 0.0 && ((la + label[0]) / 3.0) as u32 % 2 == 1;
-            return if bar {
-                Hit { surface: 3, grey: 40.0 * light }
-            } else {
-                Hit { surface: 2, grey: 215.0 * light }
-            };
-        }
-        let tape_half = (0.25 * self.half[1]).min(25.0);
-        if self.parcel.material == Material::Kraft && b.abs() < tape_half {
-            return Hit { surface: 4, grey: 135.0 * light };
-        }
-        if self.parcel.material == Material::Printed {
-            // Blocks of ink, in no order that repeats soon.
-            let (i, j) = ((a / 17.0).floor(), (b / 11.0).floor());
-            let ink = (i * 12.9898 + j * 78.233).sin() * 43758.547;
-            let step = ((ink - ink.floor()) * 4.0) as u8;
-            return Hit { surface: PRINT + step, grey: plain * (1.0 - 0.2 * f32::from(step)) };
-        }
-        Hit { surface: TOP, grey: plain }
-    }
-
-    /// Side face: darker than the top, and towards the belt.
-    fn side(&self, face: usize, z_mm: f32) -> Hit {
-        let (top, turned) = (self.plain_grey(), self.light[face]);
-        let lower = 0.7 + 0.3 * (z_mm / self.height).clamp(0.0, 1.0);
-        Hit { surface: 4 + face as u8, grey: top * turned * lower }
+    fn side(&self, face: usize, a: f32, z: f32) -> Surface {
+        surface::side(&self.parcel, self.half, face, self.shades[face], [a, z / self.height])
     }
 }
