@@ -93,6 +93,7 @@ impl Watchdog {
         let now = Instant::now();
         if let Some(name) = self.hanging(beats, alive, now) {
             tracing::error!("the {name} thread hangs: giving up, to be started again");
+            std::thread::sleep(FAREWELL);
             // Joining it would hang too.
             std::process::exit(EXIT_HANGS);
         }
