@@ -131,7 +131,7 @@ fn what_the_demo_records_is_measured_again_and_its_camera_calibrated() {
     assert!(live.len() >= 2, "{} parcels", live.len());
     if !told.contains("missing") {
         // The parcels that were inside at the end come after them. The configuration's camera has been
-        // through text, which costs its last digits.
+        // through text, which costs its last digits: a record's last digit, 0.01 mm, may be another.
         let again = measure(&folder, &[]);
         for (live, again) in live.iter().zip(&again) {
             for key in ["seq", "frame", "flags"] {
@@ -139,7 +139,8 @@ fn what_the_demo_records_is_measured_again_and_its_camera_calibrated() {
             }
             let number = |v: &serde_json::Value, key: &str| v[key].as_f64().expect("a number");
             for key in ["length_mm", "width_mm", "height_mm", "x_mm", "y_mm", "t_s"] {
-                assert!((number(live, key) - number(again, key)).abs() < 1e-3, "{live} {again}");
+                let difference = (number(live, key) - number(again, key)).abs();
+                assert!(difference < 0.0101, "{key}: {live} {again}");
             }
         }
         assert!(again.len() >= live.len());
