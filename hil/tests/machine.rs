@@ -24,7 +24,8 @@ fn status(machine: &Machine, name: &str) -> u16 {
 
 /// Start the feeder on a bus, and the peer that takes `parcels` on another.
 fn start(machine: &mut Machine, [from, to]: [&str; 2], parcels: u32, fd: &str) {
-    machine.run("rm -f /tmp/state.json /tmp/received");
+    // The peer's shell may be slower than the first look at what it says.
+    machine.run("rm -f /tmp/state.json; : >/tmp/received");
     machine.run(&format!("can_bench receive {to} {parcels} >/tmp/received 2>&1 &"));
     hil::wait_for("the peer", || {
         machine.run("cat /tmp/received").contains("listening").then_some(())
