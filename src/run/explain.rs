@@ -31,7 +31,8 @@ pub struct Explainer {
     evidence: Evidence,
     parcels: Parcels,
     looked: i64,
-    records: Vec<ParcelRecord>,
+    /// As JSON: each record, and what it was decided from.
+    records: Vec<serde_json::Value>,
     /// Heights of the columns decided, and the first one's number.
     picture: Vec<Vec<Option<f32>>>,
     pictured: i64,
@@ -92,7 +93,12 @@ impl Explainer {
         let Some(measured) = pass.fit(&self.views, face) else { return };
         let Some(place) = self.views.newest() else { return };
         let record = record_of(&measured, &self.views, place, self.records.len() as u32 + 1);
-        self.records.push(record);
+        let Ok(serde_json::Value::Object(mut told)) = serde_json::to_value(record) else { return };
+        let share = (1e3 * measured.estimate.edge_share).round() / 1e3;
+        told.insert("edge_share".into(), share.into());
+        told.insert("edges".into(), measured.estimate.edge_count.into());
+        told.insert("face".into(), told_of(face));
+        self.records.push(told.into());
     }
 
     fn draw(&mut self) {
@@ -117,8 +123,7 @@ impl Explainer {
         let io = |e: std::io::Error| Error::failure(format!("cannot write: {e}")).in_file(&path);
         let mut file = std::fs::File::create(&path).map_err(io)?;
         for record in &self.records {
-            let line = serde_json::to_string(record).map_err(|e| io(e.into()))?;
-            writeln!(file, "{line}").map_err(io)?;
+            writeln!(file, "{record}").map_err(io)?;
         }
         let path = self.folder.join("evidence.png");
         let height_max_mm = pipeline.site().height_max_mm as f32;
@@ -127,6 +132,19 @@ impl Explainer {
             .save(&path)
             .map_err(|e| Error::failure(format!("cannot write the picture: {e}")).in_file(&path))
     }
+}
+
+/// What the evidence showed of a top face, before edges were fitted.
+fn told_of(face: &Face) -> serde_json::Value {
+    let tenths = |value: f64| (10.0 * value).round() / 10.0;
+    serde_json::json!({
+        "length_mm": tenths(face.length_mm),
+        "width_mm": tenths(face.width_mm),
+        "height_mm": tenths(face.height_mm),
+        "yaw_deg": tenths(face.yaw.to_degrees()),
+        "border_share": (1e2 * face.support).round() / 1e2,
+        "cells": face.cells,
+    })
 }
 
 fn record_of(measured: &Measured, views: &Views, place: usize, seq: u32) -> ParcelRecord {

@@ -23,6 +23,8 @@ const GAP: i32 = 2;
 const PIECE_CELLS_MIN: usize = 12;
 /// Blur of lines by the cells' filters: a rectangle around cells is wider by this, cells.
 const BLUR_CELLS: f32 = 3.0;
+/// A border's cells reach beyond it by this, cells: its rectangle is wider than the face on every side.
+const BORDER_CELLS: f32 = 2.0;
 /// The shorter side of a face, cells: lines are no faces.
 const SIDE_MIN_CELLS: f32 = 5.0;
 /// Of a rectangle's border this share must be seen for pieces to be joined, ...
@@ -183,8 +185,8 @@ impl Parcels {
                 - f64::from(rectangle.column) * cell_mm,
             y_mm: evidence.row_mm(0) - f64::from(rectangle.row) * cell_mm,
             yaw: f64::from(rectangle.yaw),
-            length_mm: f64::from(rectangle.length) * cell_mm,
-            width_mm: f64::from(rectangle.width) * cell_mm,
+            length_mm: f64::from(rectangle.length - 2.0 * BORDER_CELLS) * cell_mm,
+            width_mm: f64::from(rectangle.width - 2.0 * BORDER_CELLS) * cell_mm,
             height_mm: f64::from(height_mm),
             support: f64::from(support),
             cells,

@@ -5,7 +5,7 @@ use super::fit::{Estimate, GATES_PX, Problem, Silhouette};
 use super::model::{HEIGHT, LENGTH, Outline, Params, Rounding, SCALE, WIDTH, X, Y, YAW};
 use super::observe::{Frame, PassView};
 use super::search::Search;
-use super::{EDGE_COUNT_MIN, Measured, is_box};
+use super::{BOX_EDGE_SHARE_MIN, EDGE_COUNT_MIN, Measured};
 use crate::camera::BeltView;
 use crate::stage::parcels::Face;
 use crate::stage::views::Views;
@@ -13,6 +13,10 @@ use crate::units::BeltRect;
 
 /// A face's height from the evidence is good to this, mm.
 const FACE_HEIGHT_SIGMA_MM: f64 = 1.5;
+/// A face's border is known to this, mm: a line further inside is a label's.
+const FACE_BORDER_MM: f64 = 10.0;
+/// Narrower than this is no parcel, mm.
+const LINE_MM: f64 = 6.0;
 /// Times that the profiles are taken anew, where the last fit has the edges.
 const ROUNDS: usize = 3;
 
@@ -60,7 +64,7 @@ impl WholePass<'_> {
         for round in 0..ROUNDS {
             let pass = self.look(views, &params, newest.travel_mm);
             let fitted = if round == 0 {
-                Search::from(&problem.on_some_of(&pass), &pass, params)
+                Search::from(&problem.on_some_of(&pass), &pass, params, FACE_BORDER_MM)
                     .and_then(|found| problem.refine_edges(&pass, found.params, &GATES_PX))
             } else {
                 problem.fit_edges(&pass, params)
@@ -70,8 +74,13 @@ impl WholePass<'_> {
             best = Some(fitted);
         }
         let estimate = best?;
+        // What has shrunk to a line was one: the border of a shadow, a seam.
+        if estimate.params[LENGTH].min(estimate.params[WIDTH]) < LINE_MM {
+            return None;
+        }
         let has_edges = estimate.edge_count >= EDGE_COUNT_MIN;
-        Some(Measured { estimate, is_box: is_box(&estimate), has_edges, disputed: false })
+        let is_box = estimate.edge_share >= BOX_EDGE_SHARE_MIN;
+        Some(Measured { estimate, is_box, has_edges, disputed: false })
     }
 
     /// Profiles across a cuboid's edges in every view that has any of it in the zone.
