@@ -169,7 +169,8 @@ fn record_of(measured: &Measured, views: &Views, place: usize, seq: u32) -> Parc
         shape,
         flags: Flags::default(),
         not_measured: None,
-        may_be_used: measured.is_box,
+        // A second opinion: nobody may sort by it.
+        may_be_used: false,
         belt_travel_mm: kept.at.travel_mm,
         by_encoder: false,
     };
