@@ -420,6 +420,9 @@ fn dispatch(command: Command) -> Result<()> {
             let plan = run::plan(&site);
             print(format_args!("{plan}"))?;
             plan.check_limit(site.config.limits.memory_mib_max)?;
+            if let Err(e) = source::check_interface(site.config.camera.interface) {
+                let _ = writeln!(std::io::stderr(), "warning: {e}");
+            }
             print(format_args!("the configuration is valid"))
         }
     }

@@ -109,6 +109,30 @@ fn without_a_configuration_it_ends_with_the_remedy() {
     assert!(text.contains("current/beltgauge.toml") && text.contains("remedy"), "{text}");
 }
 
+/// Features of this build; the tests are built with the same.
+const MISSING: &[&str] = &[
+    #[cfg(not(feature = "v4l2"))]
+    "v4l2",
+    #[cfg(not(feature = "aravis"))]
+    "aravis",
+];
+
+#[test]
+fn an_interface_that_is_not_built_in_ends_it_and_names_the_feature() {
+    for feature in MISSING {
+        let folder = scratch(&format!("run-without-{feature}"));
+        let mut run = start(&folder, &format!("interface = \"{feature}\""), &[]);
+        let log = wait_for(&folder.join("log"), &["camera.interface", "remedy"]);
+        assert!(log.contains(&format!("--features {feature}")), "{log}");
+        assert_eq!(run.0.wait().expect("a child").code(), Some(2), "{log}");
+        // On another machine the same configuration may be right.
+        let config = folder.join("beltgauge.toml");
+        let output = common::run(beltgauge().arg("check").arg("--config").arg(config));
+        let text = String::from_utf8_lossy(&output.stderr);
+        assert!(output.status.success() && text.contains("warning: camera.interface"), "{text}");
+    }
+}
+
 /// What a thread of a process may do: lines of its status, by their names.
 fn rights(status: &str) -> Vec<(&str, Vec<&str>)> {
     let names = ["Uid", "Gid", "Groups", "CapInh", "CapPrm", "CapEff", "CapAmb", "NoNewPrivs"];
