@@ -113,7 +113,7 @@ pub fn open(input: &Path, fps: Option<f64>) -> Result<Box<dyn FrameSource>> {
         )));
     }
     if input == Path::new("-") {
-        let y4m = Y4m::new(Box::new(std::io::stdin()), "standard input", fps)?;
+        let y4m = Y4m::new(Box::new(std::io::stdin()), y4m::STDIN, fps)?;
         return Ok(Box::new(WithoutRepeats::new(y4m)));
     }
     let metadata = std::fs::metadata(input).map_err(|e| {
