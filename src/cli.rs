@@ -268,7 +268,7 @@ pub enum Calibrate {
         #[arg(long, default_value_t = 0.0, value_parser = thickness, help_heading = BOARD)]
         board_thickness_mm: f64,
         /// Instead of stills: surveyed points, a line each: X,Y,Z in mm, u,v in px.
-        #[arg(long, conflicts_with_all = ["images", "board", "square_mm", "board_thickness_mm"])]
+        #[arg(long, value_name = "FILE", help_heading = INPUT, conflicts_with_all = ["images", "board", "square_mm", "board_thickness_mm"])]
         points: Option<PathBuf>,
         /// What `calibrate lens` wrote.
         #[arg(long, help_heading = INPUT)]

@@ -40,9 +40,7 @@ fn without_null(schema: &mut Value) {
                     parts.insert("type".into(), only);
                 }
             }
-            if parts.get("default").is_some_and(Value::is_null) {
-                parts.remove("default");
-            }
+            parts.retain(|_, part| !part.is_null());
             // How wide a number is in this program is of no use to an editor.
             parts.remove("format");
             parts.values_mut().for_each(without_null);

@@ -89,7 +89,8 @@ fn introduction(scenario: &Scenario, seconds: f64, listen: SocketAddr, out: &Pat
     };
     let stop = scenario.belt.stops.first().filter(|stop| seconds == 0.0 || stop.at_s < seconds);
     let stop = stop.map_or_else(String::new, |stop| {
-        let again = stop.every_s.map_or_else(String::new, |s| format!(" and then every {s:.0} s"));
+        let again = stop.every_s.filter(|s| seconds == 0.0 || stop.at_s + s < seconds);
+        let again = again.map_or_else(String::new, |s| format!(" and then every {s:.0} s"));
         format!(
             "The belt stops on purpose, after {:.0} s{again}, for {:.1} s. Sizes must not suffer.\n",
             stop.at_s, stop.for_s
