@@ -84,7 +84,8 @@ pub enum Command {
         /// Frames a second, when the input does not say.
         #[arg(long, help_heading = INPUT)]
         fps: Option<f64>,
-        /// Spoil the input: drop=SHARE,double=SHARE,late=MS,noise=GREY,seed=N, any of them.
+        /// Spoil the input: drop=SHARE,double=SHARE,swap=SHARE,late=MS,noise=GREY,codec=GREY,seed=N,
+        /// any of them.
         #[arg(long, value_name = "FAULTS", help_heading = INPUT)]
         inject: Option<String>,
         /// Write one JSON line a parcel to this file.

@@ -54,6 +54,11 @@ fn wait_for(path: &Path, words: &[&str]) -> String {
 fn terminate(run: &mut Run) -> Option<i32> {
     let pid = rustix::process::Pid::from_child(&run.0);
     rustix::process::kill_process(pid, rustix::process::Signal::TERM).expect("runs");
+    status(run)
+}
+
+/// The exit status, soon.
+fn status(run: &mut Run) -> Option<i32> {
     let start = Instant::now();
     loop {
         if let Some(status) = run.0.try_wait().expect("a child") {
@@ -124,7 +129,7 @@ fn an_interface_that_is_not_built_in_ends_it_and_names_the_feature() {
         let mut run = start(&folder, &format!("interface = \"{feature}\""), &[]);
         let log = wait_for(&folder.join("log"), &["camera.interface", "remedy"]);
         assert!(log.contains(&format!("--features {feature}")), "{log}");
-        assert_eq!(run.0.wait().expect("a child").code(), Some(2), "{log}");
+        assert_eq!(status(&mut run), Some(2), "{log}");
         // On another machine the same configuration may be right.
         let config = folder.join("beltgauge.toml");
         let output = common::run(beltgauge().arg("check").arg("--config").arg(config));
@@ -268,5 +273,5 @@ fn an_error_reaches_whoever_is_slow_to_read_it() {
     std::io::Read::read_to_end(&mut reader, &mut text).expect("a pipe");
     let text = String::from_utf8_lossy(&text);
     assert!(text.contains("error: ") && text.contains("no-such-file.toml"), "lost");
-    assert_eq!(check.0.wait().expect("a child").code(), Some(2));
+    assert_eq!(status(&mut check), Some(2));
 }
