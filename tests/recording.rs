@@ -39,7 +39,7 @@ fn measure(folder: &Path, arguments: &[&str]) -> Vec<serde_json::Value> {
 /// The demo's belt in a quarter of its pixels.
 fn small() -> Scenario {
     let text = include_str!("../config/demo/scenario.toml")
-        .replace("frames = 100000", "frames = 170")
+        .replace("exposure_ms", "frames = 170\nexposure_ms")
         .replace("[1280, 800]", "[640, 400]")
         .replace("fx_px = 679.5", "fx_px = 339.7")
         .replace("fy_px = 679.9", "fy_px = 339.9")

@@ -6,7 +6,7 @@ use crate::error::{Error, Result};
 use crate::event::ParcelRecord;
 use crate::plc::interface;
 use crate::plc::registers::ImportStatus;
-use crate::source::{Feed, Live, Recorder, open_camera};
+use crate::source::{Feed, Live, Recorder, check_interface, open_camera};
 use crate::store::{ImportRecord, Store};
 use serde::Serialize;
 use signal_hook::consts::{SIGINT, SIGTERM};
@@ -45,6 +45,7 @@ pub fn run(options: &Options<'_>) -> Result<()> {
         store.settle();
     }
     let mut site = options.config.map_or_else(|| store.site(), Site::load)?;
+    check_interface(site.config.camera.interface)?;
     if options.config.is_none() {
         site.config.plc.state_file.get_or_insert_with(|| store.plc_state());
     }

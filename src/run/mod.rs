@@ -8,6 +8,7 @@ pub mod budget;
 pub mod calibrate;
 pub mod demo;
 mod demo_kit;
+mod demo_results;
 mod explain;
 pub mod import;
 pub mod live;

@@ -102,6 +102,9 @@ impl Parcel {
 #[serde(deny_unknown_fields)]
 pub struct RandomTable {
     pub(super) count: usize,
+    /// After the last one the first comes again.
+    #[serde(default)]
+    pub(super) again: bool,
     /// Centre of the first one before the belt has moved.
     first_x_mm: f64,
     /// Free belt between neighbours, along travel.
@@ -145,6 +148,14 @@ impl RandomTable {
             end_mm -= half_mm;
         }
         parcels
+    }
+
+    /// How much belt they take, with a gap before the first comes again.
+    pub(super) fn loop_mm(&self, parcels: &[Parcel]) -> f64 {
+        let last_mm = parcels.last().map_or(self.first_x_mm, |parcel| parcel.x_mm);
+        // Half of the longest of both, whichever way they are turned.
+        let half_mm = 0.5 * self.length_mm[1].hypot(self.width_mm[1]);
+        self.first_x_mm - last_mm + 2.0 * half_mm + self.gap_mm[0]
     }
 }
 

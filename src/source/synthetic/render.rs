@@ -171,7 +171,7 @@ impl Renderer {
     }
 
     fn solid(&self, parcel: &Parcel, at: Position) -> Option<Solid> {
-        let place = parcel.place(at.travel_mm, at.aside_mm);
+        let place = self.scenario.place(parcel, at.travel_mm, at.aside_mm);
         let (sin, cos) = place.yaw_deg.to_radians().sin_cos();
         // Room for shadow and blur around the solid itself.
         let margin_mm = shadow_reach_mm(parcel.height_mm as f32) as f64 + 5.0;
