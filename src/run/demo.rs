@@ -1,7 +1,7 @@
 //! `beltgauge demo`: the appliance in real time on the synthetic belt, and the truth beside it.
 
 use super::annotate::draw;
-use super::{Appliance, Progress, demo_kit, log};
+use super::{Appliance, Progress, demo_kit, log, memory};
 use crate::config::{Config, Site};
 use crate::error::{Error, Result};
 use crate::event::ParcelRecord;
@@ -93,6 +93,10 @@ pub fn run(options: Options<'_>) -> Result<String> {
         "rendering the belt; Modbus TCP on {listen}, registers as in config/REGISTERS.md\n"
     ));
     let mut source = Synthetic::new(scenario.clone())?;
+    let recorder_mib = match options.record {
+        None => 0,
+        Some(_) => memory::room_for_recorder(&site)?,
+    };
     let appliance = Appliance::new(site)?;
     let mut paced = Paced::new(&mut source, Pace::RealTime);
     let mut recorder = None;
@@ -101,7 +105,8 @@ pub fn run(options: Options<'_>) -> Result<String> {
         Some(folder) => {
             std::fs::create_dir_all(folder).map_err(failed)?;
             // First: it refuses the folder of an earlier recording.
-            let recorder = recorder.insert(Recorder::create(&mut paced, &folder.join(RECORDING))?);
+            let path = folder.join(RECORDING);
+            let recorder = recorder.insert(Recorder::create(&mut paced, &path, recorder_mib)?);
             demo_kit::write(folder, &scenario, &camera, CONFIG)?;
             recorder
         }
