@@ -224,7 +224,7 @@ fn least(of_all: &[[Opinion; 2]], starts: Vec<Vec<bool>>) -> Vec<bool> {
             match changed.min_by(|a, b| a.0.total_cmp(&b.0)) {
                 // A gain that is none but for rounding would go round for ever.
                 Some((lower, next)) if lower < cost - 1e-9 * cost.abs() => {
-                    (cost, choice) = (lower, next)
+                    (cost, choice) = (lower, next);
                 }
                 _ => return (cost, choice),
             }
