@@ -61,7 +61,7 @@ fn a_recording_of_a_camera_that_lost_frames_gives_the_same_records_again() {
     let mut source = FaultInjector::new(Box::new(belt), faults);
     let mut feed = Paced::new(&mut source, Pace::Unhurried);
     let path = folder.join("recording.y4m");
-    let mut recorder = Recorder::create(&mut feed, &path).expect("room");
+    let mut recorder = Recorder::create(&mut feed, &path, 8).expect("room");
     let mut buffer = Block::own(640 * 400).expect("small");
     let site = Site::load(&config).expect("valid");
     let (_, mut pipeline) = beltgauge::run::build(site).expect("fits");

@@ -11,29 +11,8 @@ use beltgauge::source::synthetic::{Scenario, Synthetic};
 use beltgauge::stage::evidence::Evidence;
 use beltgauge::stage::views::Views;
 
-/// Neighbours 12 mm apart, of other heights, and a flat envelope; 1280 x 800, 1.5 m above the belt.
-const SCENARIO: &str = r#"
-seed = 5
-fps = 30
-frames = 170
-exposure_ms = 1.5
-[camera]
-image_size_px = [1280, 800]
-[camera.lens]
-model = "brown"
-fx_px = 680.0
-fy_px = 680.0
-cx_px = 640.0
-cy_px = 400.0
-distortion = [-0.18, 0.08, 0.0, 0.0, -0.008]
-[camera.pose]
-rotation = [[1.0, 0.0, 0.0], [0.0, -1.0, 0.0], [0.0, 0.0, -1.0]]
-translation_mm = [0.0, 0.0, 1500.0]
-[belt]
-speed_mm_per_s = 500.0
-width_mm = 800
-grey = 45
-texture_grey = 1.3
+/// Neighbours 12 mm apart, of other heights, and a flat envelope.
+const PARCELS: &str = r#"
 [[parcel]]
 length_mm = 180.0
 width_mm = 120.0
@@ -71,7 +50,12 @@ const SHARE_MIN: f64 = 0.5;
 
 #[test]
 fn cells_of_a_top_face_agree_on_its_height() {
-    let scenario = Scenario::parse(SCENARIO).expect("valid");
+    let camera = common::camera_above([1280, 800], 680.0, 1500.0, [-0.18, 0.08, 0.0, 0.0, -0.008]);
+    let text = format!(
+        "seed = 5\nfps = 30\nframes = 170\nexposure_ms = 1.5\n{camera}\
+         [belt]\nspeed_mm_per_s = 500\nwidth_mm = 800\ngrey = 45\ntexture_grey = 1.3\n{PARCELS}"
+    );
+    let scenario = Scenario::parse(&text).expect("valid");
     let config = Config::parse(CONFIG).expect("valid");
     let site = Site::new(config, scenario.camera().expect("valid")).expect("a zone in view");
     let (view, zone, height_max_mm) = (site.view.clone(), site.config.zone, site.height_max_mm);

@@ -2,7 +2,7 @@
 
 use super::annotate::draw;
 use super::demo_results::Results;
-use super::{Appliance, Progress, demo_kit, log};
+use super::{Appliance, Progress, demo_kit, log, memory};
 use crate::config::{Config, Site};
 use crate::error::{Error, Result};
 use crate::event::ParcelRecord;
@@ -134,6 +134,10 @@ pub fn run(options: Options<'_>) -> Result<String> {
     // Created now, not at the end: then a folder that cannot be written to costs no time.
     let mut results = Results::create(&options.out.join("parcels.jsonl"))?;
     let mut source = Synthetic::new(scenario.clone())?;
+    let recorder_mib = match options.record {
+        None => 0,
+        Some(_) => memory::room_for_recorder(&site)?,
+    };
     let appliance = Appliance::new(site)?;
     let mut paced = Paced::new(&mut source, Pace::RealTime);
     let mut recorder = None;
@@ -142,7 +146,8 @@ pub fn run(options: Options<'_>) -> Result<String> {
         Some(folder) => {
             std::fs::create_dir_all(folder).map_err(failed)?;
             // First: it refuses the folder of an earlier recording.
-            let recorder = recorder.insert(Recorder::create(&mut paced, &folder.join(RECORDING))?);
+            let path = folder.join(RECORDING);
+            let recorder = recorder.insert(Recorder::create(&mut paced, &path, recorder_mib)?);
             demo_kit::write(folder, &scenario, &camera, CONFIG)?;
             recorder
         }

@@ -1,6 +1,6 @@
 //! `beltgauge run`: the appliance on a live camera, until it is told to stop.
 
-use super::{Appliance, ImportBoard, Progress, Watchdog, log};
+use super::{Appliance, ImportBoard, Progress, Watchdog, log, memory};
 use crate::config::{Can, Site};
 use crate::error::{Error, Result};
 use crate::event::ParcelRecord;
@@ -55,7 +55,10 @@ pub fn run(options: &Options<'_>) -> Result<()> {
     let mut recorder = None;
     let feed: &mut dyn Feed = match options.record {
         None => &mut live,
-        Some(path) => recorder.insert(Recorder::create(&mut live, path)?),
+        Some(path) => {
+            let mib = memory::room_for_recorder(&site)?;
+            recorder.insert(Recorder::create(&mut live, path, mib)?)
+        }
     };
     let listen = site.config.modbus.listen;
     let watchdog = Watchdog::new(options.watchdog)?;
