@@ -11,9 +11,11 @@ use crate::stage::views::Views;
 use crate::units::BeltRect;
 
 /// A face's height from the evidence is good to this, mm.
-const FACE_HEIGHT_SIGMA_MM: f64 = 1.5;
+const FACE_HEIGHT_SIGMA_MM: f64 = 6.0;
 /// A border further inside must explain this share of the edges more.
 const CLEARLY_BETTER: f64 = 0.03;
+/// Lower than this is the belt, mm.
+const HEIGHT_MIN_MM: f64 = 2.4;
 /// Narrower than this is no parcel, mm.
 const LINE_MM: f64 = 6.0;
 /// Times that the profiles are taken anew, where the last fit has the edges.
@@ -83,6 +85,10 @@ impl WholePass<'_> {
             best = Some(fitted);
         }
         let estimate = best?;
+        // What lies on the belt itself, its texture or a label stuck to it, is no parcel.
+        if estimate.params[HEIGHT] < HEIGHT_MIN_MM {
+            return None;
+        }
         // What has shrunk to a line was one: the border of a shadow, a seam.
         if estimate.params[LENGTH].min(estimate.params[WIDTH]) < LINE_MM {
             return None;

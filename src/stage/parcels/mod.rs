@@ -35,6 +35,8 @@ const NARROW_MM: f32 = 40.0;
 const GAP: i32 = 2;
 /// Columns behind a group that must be decided before it is whole.
 const WAIT_COLUMNS: usize = 8;
+/// A smaller group this near to a larger one that is not whole waits for it, cells.
+const BESIDE_CELLS: usize = 6;
 /// A beginning of fewer cells is an accident.
 const CELLS_MIN: usize = 12;
 /// What is looked at around a beginning at first, and if that does not hold all sides, mm.
@@ -47,16 +49,16 @@ const SUPPORT_MIN: f64 = 0.65;
 const SIDE_SUPPORT_MIN: f64 = 0.25;
 /// Lines that happen to lie right give this share.
 const ACCIDENT_SUPPORT: f64 = 0.55;
-/// Steps of height, mm, in which the plane of the sharpest border is sought, ...
-const HEIGHT_STEPS_MM: [f64; 2] = [5.0, 2.0];
-/// ... so many of each at most.
-const CLIMB_MAX: usize = 6;
+/// Where the plane of the sharpest border is sought around the cells' height, mm, coarse and fine.
+const HEIGHT_OFFSETS_MM: [&[f64]; 2] = [&[-5.0, 5.0, -10.0, 10.0, -15.0, 15.0], &[-2.5, 2.5]];
 /// What is looked at around a known border, mm.
 const NEAR_MM: f64 = 40.0;
 /// Cells this far around a face are its own: its sides, mm.
 const SIDE_MM: f64 = 10.0;
 /// Two faces are one parcel's when this share of one lies inside the other.
 const OVERLAP_SHARE: f64 = 0.3;
+/// What lies on another has its border, and so has that one, for this share.
+const STACK_SUPPORT: f64 = 0.75;
 /// Faces whose heights differ by more are on top of each other, mm.
 const STEP_MM: f64 = 12.0;
 
@@ -146,7 +148,7 @@ impl Parcels {
             }
             if let Some(face) = found {
                 self.claim(&face);
-                self.keep(face);
+                self.keep(&face);
             }
         }
         let (passed, waiting): (Vec<Face>, Vec<Face>) =
@@ -223,11 +225,25 @@ impl Parcels {
         let is_whole = |members: &[usize]| {
             ended || members.iter().all(|i| i / self.rows + WAIT_COLUMNS < columns)
         };
-        let mut waiting = vec![false; self.cells.len()];
+        let extent = |members: &[usize]| {
+            let start = [usize::MAX, 0, usize::MAX, 0];
+            members.iter().fold(start, |[a, b, c, d], i| {
+                let (column, row) = (i / self.rows, i % self.rows);
+                [a.min(column), b.max(column), c.min(row), d.max(row)]
+            })
+        };
+        let mut waiting: Vec<[usize; 4]> = Vec::new();
         let mut whole = Vec::new();
         for members in groups {
-            if !is_whole(&members) || members.iter().any(|&i| waiting[i]) {
-                members.iter().for_each(|&i| waiting[i] = true);
+            let here = extent(&members);
+            let beside = |[a, b, c, d]: &[usize; 4]| {
+                *a <= here[1] + BESIDE_CELLS
+                    && here[0] <= b + BESIDE_CELLS
+                    && *c <= here[3] + BESIDE_CELLS
+                    && here[2] <= d + BESIDE_CELLS
+            };
+            if !is_whole(&members) || waiting.iter().any(beside) {
+                waiting.push(here);
                 continue;
             }
             let mut heights: Vec<f32> = members.iter().map(|&i| self.cells[i].height_mm).collect();
@@ -273,23 +289,17 @@ impl Parcels {
         let mut best = self.rectangle(views, height_mm, around, inside)?;
         // The plane on which the border is sharpest.
         let mut top_mm = height_mm;
-        for step_mm in HEIGHT_STEPS_MM {
-            for direction in [step_mm, -step_mm] {
-                for _ in 0..CLIMB_MAX {
-                    let trial_mm = top_mm + direction;
-                    if trial_mm < f64::from(HEIGHT_MIN_MM)
-                        || trial_mm > f64::from(self.height_max_mm)
-                    {
-                        break;
-                    }
-                    self.fill(views, trial_mm, border_of(&best));
-                    let middle = [best.x_mm as f32, best.y_mm as f32];
-                    let Some(found) = self.search.near(&self.stack, middle, best.yaw as f32) else {
-                        break;
-                    };
-                    if found.score_mm <= best.score_mm {
-                        break;
-                    }
+        for offsets_mm in HEIGHT_OFFSETS_MM {
+            let from_mm = top_mm;
+            for offset_mm in offsets_mm {
+                let trial_mm = from_mm + offset_mm;
+                if !(f64::from(HEIGHT_MIN_MM)..f64::from(self.height_max_mm)).contains(&trial_mm) {
+                    continue;
+                }
+                self.fill(views, trial_mm, border_of(&best));
+                let middle = [best.x_mm as f32, best.y_mm as f32];
+                let found = self.search.near(&self.stack, middle, best.yaw as f32);
+                if let Some(found) = found.filter(|found| found.score_mm > best.score_mm) {
                     (best, top_mm) = (found, trial_mm);
                 }
             }
@@ -298,7 +308,7 @@ impl Parcels {
         let narrower = self.search.narrower(&self.stack, &best);
         let weakest = best.sides.iter().copied().fold(1.0, f64::min);
         let is_face = best.support() >= SUPPORT_MIN && weakest >= SIDE_SUPPORT_MIN;
-        is_face.then(|| Face {
+        is_face.then_some(Face {
             rectangle: best,
             narrower,
             height_mm: top_mm,
@@ -344,7 +354,7 @@ impl Parcels {
     }
 
     /// Keep a face beside those that wait: of those at one place the best, or a stack.
-    fn keep(&mut self, face: Face) {
+    fn keep(&mut self, face: &Face) {
         let same = |other: &Face| {
             face.rectangle.share_inside(&other.rectangle) > OVERLAP_SHARE
                 || other.rectangle.share_inside(&face.rectangle) > OVERLAP_SHARE
@@ -355,11 +365,11 @@ impl Parcels {
         let (rivals, others): (Vec<Face>, Vec<Face>) = self.waiting.drain(..).partition(same);
         self.waiting = others;
         if let [rival] = rivals[..]
-            && let Some(stack) = stacked(face, rival)
+            && let Some(stack) = stacked(face, &rival)
         {
             self.waiting.push(stack);
-        } else if worth(&face) > rivals.iter().map(worth).sum() {
-            self.waiting.push(face);
+        } else if worth(face) > rivals.iter().map(worth).sum() {
+            self.waiting.push(*face);
         } else {
             self.waiting.extend(rivals);
         }
@@ -373,12 +383,12 @@ fn worth(face: &Face) -> f64 {
 }
 
 /// A stack, if one of two faces lies on the other.
-fn stacked(one: Face, other: Face) -> Option<Face> {
+fn stacked(one: &Face, other: &Face) -> Option<Face> {
     let (low, high) = if one.height_mm < other.height_mm { (one, other) } else { (other, one) };
     let on_top = high.height_mm - low.height_mm > STEP_MM
         && high.rectangle.share_inside(&low.rectangle) > 0.9
-        && low.rectangle.support().min(high.rectangle.support()) > WHOLE_SUPPORT;
-    on_top.then_some(Face { height_mm: high.height_mm, stacked: true, ..low })
+        && low.rectangle.support().min(high.rectangle.support()) > STACK_SUPPORT;
+    on_top.then_some(Face { height_mm: high.height_mm, stacked: true, ..*low })
 }
 
 /// The surroundings of a rectangle: x and y, lowest and highest.

@@ -295,9 +295,9 @@ impl RectangleSearch {
             let rectangles = (least_px..=most_px).map(|by| {
                 let mut lines = whole;
                 if side % 2 == 0 {
-                    lines[side] += by
+                    lines[side] += by;
                 } else {
-                    lines[side] -= by
+                    lines[side] -= by;
                 }
                 self.rectangle(&turned, yaw, 0, lines)
             });
@@ -432,11 +432,11 @@ fn longest_stretch(sums: impl Iterator<Item = i32>) -> i32 {
 }
 
 /// The lines of longest stretches, no two side by side; as many as there is room for.
-fn lines<'a>(
+fn lines(
     places: std::ops::Range<usize>,
     stretch: impl Fn(usize) -> i32,
-    found: &'a mut [usize; LINES],
-) -> &'a [usize] {
+    found: &mut [usize; LINES],
+) -> &[usize] {
     let mut stretches = [0i32; LINES];
     let mut count = 0;
     let mut run: Option<(usize, usize, i32)> = None;
