@@ -91,7 +91,7 @@ impl Rectangle {
     /// The middle of a side, numbered as in `sides`: X less travel, and Y, mm.
     pub fn middle_of_side(&self, side: usize) -> (f64, f64) {
         let (sin, cos) = self.yaw.sin_cos();
-        let sign = if side % 2 == 0 { 0.5 } else { -0.5 };
+        let sign = if side.is_multiple_of(2) { 0.5 } else { -0.5 };
         let (along, across) =
             if side < 2 { (sign * self.length_mm, 0.0) } else { (0.0, sign * self.width_mm) };
         (self.x_mm + cos * along - sin * across, self.y_mm + sin * along + cos * across)
@@ -207,16 +207,10 @@ impl RectangleSearch {
 
     /// The best rectangle around a point whose direction is known to a degree.
     pub fn near(&mut self, stack: &Stack, inside_mm: [f32; 2], yaw: f32) -> Option<Rectangle> {
-        let mut best: Option<Rectangle> = None;
-        for turn in NEAR_TURNS_DEG {
-            let found = self.best_at(stack, inside_mm, yaw + turn.to_radians());
-            if let Some(found) = found
-                && best.is_none_or(|best| found.score_mm > best.score_mm)
-            {
-                best = Some(found);
-            }
-        }
-        best
+        let turned = NEAR_TURNS_DEG
+            .into_iter()
+            .filter_map(|turn| self.best_at(stack, inside_mm, yaw + turn.to_radians()));
+        turned.max_by(|a, b| a.score_mm.total_cmp(&b.score_mm))
     }
 
     fn best_at(&mut self, stack: &Stack, inside_mm: [f32; 2], yaw: f32) -> Option<Rectangle> {
@@ -303,11 +297,11 @@ impl RectangleSearch {
         // Left and right column, low and high row.
         let whole = [column - du, column + du, row - dv, row + dv];
         let moved = |mut lines: [usize; 4], side: usize, by: usize| {
-            if side % 2 == 0 {
-                lines[side] += by
+            if side.is_multiple_of(2) {
+                lines[side] += by;
             } else {
-                lines[side] -= by
-            };
+                lines[side] -= by;
+            }
             lines
         };
         let least_px = (APART_MM / px_mm).ceil() as usize;
