@@ -21,7 +21,7 @@ use rectangle::RectangleSearch;
 use stack::{Stack, Window};
 use still::Still;
 
-pub use rectangle::{NARROWER, Rectangle};
+pub use rectangle::Rectangle;
 
 /// Trial planes are this far apart, mm.
 const PLANE_STEP_MM: f32 = 3.0;
@@ -47,10 +47,6 @@ const WHOLE_SUPPORT: f64 = 0.9;
 const SUPPORT_MIN: f64 = 0.65;
 /// Each side has at least this share of edge.
 const SIDE_SUPPORT_MIN: f64 = 0.25;
-/// A side that no taller neighbour hides has at least this share, ...
-const WHOLE_SIDE_SUPPORT: f64 = 0.45;
-/// ... and a neighbour this far away may hide it, mm.
-const HIDDEN_MM: f64 = 40.0;
 /// Lines that happen to lie right give this share.
 const ACCIDENT_SUPPORT: f64 = 0.55;
 /// Where the plane of the sharpest border is sought around the cells' height, mm, coarse and fine.
@@ -71,8 +67,8 @@ const STEP_MM: f64 = 12.0;
 pub struct Face {
     /// Its border.
     pub rectangle: Rectangle,
-    /// Borders with one or two sides further inside that may be it, too.
-    pub narrower: [Option<Rectangle>; NARROWER],
+    /// For each side the border with a line further inside that may be it, too.
+    pub narrower: [Option<Rectangle>; 4],
     /// Over the belt, mm.
     pub height_mm: f64,
     /// Cells that began it.
@@ -159,22 +155,7 @@ impl Parcels {
             self.waiting.drain(..).partition(|face| face.rectangle.trailing_mm() > end_mm);
         self.waiting = waiting;
         self.gone.extend(&passed);
-        passed.into_iter().filter(|face| self.sides_hold(face)).collect()
-    }
-
-    /// Whether each side is there, or hidden behind a taller neighbour: a strip of shadow between a
-    /// top edge and its shadow has two good sides, and hardly ends.
-    fn sides_hold(&self, face: &Face) -> bool {
-        let hides = |x_mm: f64, y_mm: f64| {
-            let others = self.waiting.iter().chain(&self.gone);
-            others
-                .filter(|other| other.height_mm > face.height_mm + STEP_MM)
-                .any(|other| other.rectangle.outside_mm(x_mm, y_mm) < HIDDEN_MM)
-        };
-        (0..4).all(|side| {
-            let (x_mm, y_mm) = face.rectangle.middle_of_side(side);
-            face.rectangle.sides[side] >= WHOLE_SIDE_SUPPORT || hides(x_mm, y_mm)
-        })
+        passed
     }
 
     /// Columns decided since the last time; old ones go.

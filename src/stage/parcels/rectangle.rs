@@ -41,9 +41,6 @@ const NEARLY: f64 = 0.75;
 /// Sides shorter than this are no parcel, mm.
 const SIDE_MIN_MM: f64 = 12.0;
 
-/// Rectangles with one or two of four sides further inside.
-pub const NARROWER: usize = 10;
-
 /// A rectangle on a plane, belt-fixed.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
 pub struct Rectangle {
@@ -86,15 +83,6 @@ impl Rectangle {
     pub fn reach_mm(&self) -> f64 {
         let (sin, cos) = self.yaw.sin_cos();
         0.5 * (self.length_mm * cos.abs() + self.width_mm * sin.abs())
-    }
-
-    /// The middle of a side, numbered as in `sides`: X less travel, and Y, mm.
-    pub fn middle_of_side(&self, side: usize) -> (f64, f64) {
-        let (sin, cos) = self.yaw.sin_cos();
-        let sign = if side.is_multiple_of(2) { 0.5 } else { -0.5 };
-        let (along, across) =
-            if side < 2 { (sign * self.length_mm, 0.0) } else { (0.0, sign * self.width_mm) };
-        (self.x_mm + cos * along - sin * across, self.y_mm + sin * along + cos * across)
     }
 
     /// Share of this rectangle that lies inside another, by a grid of points.
@@ -281,48 +269,35 @@ impl RectangleSearch {
         }
     }
 
-    /// Rectangles with one or two sides further inside that are nearly as well explained: of two lines
-    /// one may be a shadow's, and the fit must tell.
-    pub fn narrower(&mut self, stack: &Stack, outer: &Rectangle) -> [Option<Rectangle>; NARROWER] {
-        let mut found = [None; NARROWER];
+    /// For each side the best rectangle whose side is further inside, if it is nearly as well explained:
+    /// of two lines one may be a shadow's, and the fit must tell.
+    pub fn narrower(&mut self, stack: &Stack, outer: &Rectangle) -> [Option<Rectangle>; 4] {
         let yaw = outer.yaw as f32;
-        let Some(turned) = self.turn(stack, yaw) else { return found };
+        let Some(turned) = self.turn(stack, yaw) else { return [None; 4] };
         let px_mm = f64::from(turned.px_mm);
         let (column, row) = turned.cell(outer.x_mm as f32, outer.y_mm as f32);
         let half = |length_mm: f64| (0.5 * length_mm / px_mm).round() as usize;
         let (du, dv) = (half(outer.length_mm), half(outer.width_mm));
         if column < du || row < dv || column + du >= turned.columns || row + dv >= turned.rows {
-            return found;
+            return [None; 4];
         }
-        // Left and right column, low and high row.
         let whole = [column - du, column + du, row - dv, row + dv];
-        let moved = |mut lines: [usize; 4], side: usize, by: usize| {
-            if side.is_multiple_of(2) {
-                lines[side] += by;
-            } else {
-                lines[side] -= by;
-            }
-            lines
-        };
         let least_px = (APART_MM / px_mm).ceil() as usize;
-        let inward: [Option<usize>; 4] = std::array::from_fn(|side| {
+        std::array::from_fn(|side| {
             let most_px = (NARROWER_SHARE * 2.0 * [du, dv][side / 2] as f64) as usize;
-            let rectangle = |by: usize| self.rectangle(&turned, yaw, 0, moved(whole, side, by));
-            let by = (least_px..=most_px)
-                .max_by(|&a, &b| rectangle(a).support().total_cmp(&rectangle(b).support()))?;
+            let rectangles = (least_px..=most_px).map(|by| {
+                let mut lines = whole;
+                if side % 2 == 0 {
+                    lines[side] += by;
+                } else {
+                    lines[side] -= by;
+                }
+                self.rectangle(&turned, yaw, 0, lines)
+            });
+            let best = rectangles.max_by(|a, b| a.support().total_cmp(&b.support()))?;
             let which = [1, 0, 3, 2][side];
-            (rectangle(by).sides[which] > NEARLY * outer.sides[which]).then_some(by)
-        });
-        let sides = || (0..4).filter_map(|side| inward[side].map(|by| (side, by)));
-        let one = sides().map(|(side, by)| moved(whole, side, by));
-        let two = sides().flat_map(|(a, by)| {
-            let first = moved(whole, a, by);
-            sides().filter(move |(b, _)| *b > a).map(move |(b, by)| moved(first, b, by))
-        });
-        for (place, lines) in found.iter_mut().zip(one.chain(two)) {
-            *place = Some(self.rectangle(&turned, yaw, 0, lines));
-        }
-        found
+            (best.sides[which] > NEARLY * outer.sides[which]).then_some(best)
+        })
     }
 
     /// The edge pixels in a grid turned by `yaw`, each as wide as two pixels across its side.
