@@ -68,7 +68,7 @@ fn cells_of_a_top_face_agree_on_its_height_and_its_border_is_found() {
     let mut plan = Plan::default();
     Views::plan(&view, &mut plan);
     Evidence::plan(&view, &zone, height_max_mm, &mut plan);
-    Parcels::plan(&view, &zone, &mut plan);
+    Parcels::plan(&view, &zone, height_max_mm, &mut plan);
     let mut memory = plan.reserve(512).expect("fits");
     let mut views = Views::new(&view, &zone, &mut memory).expect("planned");
     let mut evidence =
@@ -89,17 +89,18 @@ fn cells_of_a_top_face_agree_on_its_height_and_its_border_is_found() {
         if views.offer(pipeline.pixels(), at, time) {
             let place = views.newest().expect("just kept");
             evidence.add(&views, place);
-            parcels.add(views.grey(place), pipeline.seen());
+            parcels.add(&views, place, pipeline.seen());
         }
         evidence.advance(&views, at.travel_mm, at.breaks);
         if evidence.decided().end - looked >= 8 {
             looked = evidence.decided().end;
-            faces.extend(parcels.passed(&evidence, &views, zone.x_max_mm - at.travel_mm));
+            let end_mm = zone.x_max_mm - at.travel_mm;
+            faces.extend(parcels.passed(&evidence, &views, end_mm, |_| true));
         }
         offset_mm = scenario.travel_at_frame_mm(time.index) - at.travel_mm;
     }
 
-    faces.extend(parcels.passed(&evidence, &views, f64::NEG_INFINITY));
+    faces.extend(parcels.passed(&evidence, &views, f64::NEG_INFINITY, |_| true));
     assert_eq!(faces.len(), scenario.parcels().len(), "{faces:?}");
     let decided = evidence.decided();
     for parcel in scenario.parcels() {

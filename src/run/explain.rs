@@ -49,7 +49,7 @@ impl Explainer {
         let mut plan = Plan::default();
         Views::plan(view, &mut plan);
         Evidence::plan(view, zone, site.height_max_mm, &mut plan);
-        Parcels::plan(view, zone, &mut plan);
+        Parcels::plan(view, zone, site.height_max_mm, &mut plan);
         let mib = plan.bytes().div_ceil(1 << 20);
         let mut memory = plan.reserve(mib)?;
         let views = Views::new(view, zone, &mut memory)?;
@@ -67,7 +67,7 @@ impl Explainer {
             && let Some(place) = self.views.newest()
         {
             self.evidence.add(&self.views, place);
-            self.parcels.add(self.views.grey(place), pipeline.seen());
+            self.parcels.add(&self.views, place, pipeline.seen());
         }
         self.evidence.advance(&self.views, at.travel_mm, at.breaks);
         if self.evidence.decided().end - self.looked >= LOOK_COLUMNS {
@@ -78,20 +78,14 @@ impl Explainer {
     fn look(&mut self, pipeline: &Pipeline, end_mm: f64) {
         self.looked = self.evidence.decided().end;
         self.draw();
-        for face in self.parcels.passed(&self.evidence, &self.views, end_mm) {
-            self.record(pipeline, &face);
+        let pass = whole_pass(pipeline);
+        let is_raised = |face: &Face| pass.fit(&self.views, face).is_some();
+        for face in self.parcels.passed(&self.evidence, &self.views, end_mm, is_raised) {
+            self.record(&pass, &face);
         }
     }
 
-    fn record(&mut self, pipeline: &Pipeline, face: &Face) {
-        let site = pipeline.site();
-        let pass = WholePass {
-            geometry: &site.view,
-            zone: &site.config.zone,
-            height_max_mm: site.height_max_mm,
-            rounding: Rounding::of_radius(site.config.measure.edge_radius_mm),
-            seen: pipeline.seen(),
-        };
+    fn record(&mut self, pass: &WholePass<'_>, face: &Face) {
         let Some(measured) = pass.fit(&self.views, face) else { return };
         let Some(place) = self.views.newest() else { return };
         let record = record_of(&measured, &self.views, place, self.records.len() as u32 + 1);
@@ -133,6 +127,17 @@ impl Explainer {
         picture
             .save(&path)
             .map_err(|e| Error::failure(format!("cannot write the picture: {e}")).in_file(&path))
+    }
+}
+
+fn whole_pass(pipeline: &Pipeline) -> WholePass<'_> {
+    let site = pipeline.site();
+    WholePass {
+        geometry: &site.view,
+        zone: &site.config.zone,
+        height_max_mm: site.height_max_mm,
+        rounding: Rounding::of_radius(site.config.measure.edge_radius_mm),
+        seen: pipeline.seen(),
     }
 }
 
@@ -179,6 +184,7 @@ fn record_of(measured: &Measured, views: &Views, place: usize, seq: u32) -> Parc
         by_encoder: false,
     };
     record.flags.set(Flags::SILHOUETTE_ONLY, !measured.has_edges);
+    record.flags.set(Flags::HEIGHT_DISPUTED, measured.disputed);
     record.rounded()
 }
 

@@ -54,8 +54,8 @@ const SIGMA_FLOOR_MM: f64 = 0.3;
 const EDGE_HEIGHT_SIGMA_MM: f64 = 0.8;
 /// What a shape that is no box leaves open.
 const ENCLOSING_SIGMA_MM: f64 = 4.0;
-/// Edges and corners that differ by more than so many sigma do not mean the same top face.
-const DISPUTED_SIGMA: f64 = 3.0;
+/// Witnesses of a height that differ by more than so many sigma do not mean the same top face.
+pub(super) const DISPUTED_SIGMA: f64 = 3.0;
 /// Dimensions below this are no parcel.
 const SIDE_MIN_MM: f64 = 5.0;
 

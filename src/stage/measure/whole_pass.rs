@@ -1,7 +1,7 @@
 //! The fit on a pass that lies before one as a whole: no view was spoiled by an early, wrong estimate.
 
 use super::corners::TopMotion;
-use super::fit::{Estimate, GATES_PX, Problem, Silhouette};
+use super::fit::{DISPUTED_SIGMA, Estimate, GATES_PX, Problem, Silhouette};
 use super::model::{HEIGHT, LENGTH, Outline, Params, Rounding, SCALE, WIDTH, X, Y, YAW};
 use super::observe::{Frame, PassView};
 use super::{BOX_EDGE_SHARE_MIN, EDGE_COUNT_MIN, Measured};
@@ -95,7 +95,9 @@ impl WholePass<'_> {
         }
         let has_edges = estimate.edge_count >= EDGE_COUNT_MIN;
         let is_box = estimate.edge_share >= BOX_EDGE_SHARE_MIN;
-        Some(Measured { estimate, is_box, has_edges, disputed: false })
+        let off_mm = (estimate.params[HEIGHT] - height_mm).abs();
+        let disputed = off_mm > DISPUTED_SIGMA * FACE_HEIGHT_SIGMA_MM.hypot(estimate.sigma[HEIGHT]);
+        Some(Measured { estimate, is_box, has_edges, disputed })
     }
 
     /// Profiles across a cuboid's edges in every view that has any of it in the zone.

@@ -8,17 +8,18 @@
 
 mod rectangle;
 mod stack;
+mod steps;
 mod still;
 
 use super::evidence::{Cell, Evidence};
 use super::views::Views;
 use crate::camera::BeltView;
 use crate::error::Result;
-use crate::image::Plane;
 use crate::plan::{Memory, Plan};
 use crate::units::BeltRect;
-use rectangle::RectangleSearch;
+use rectangle::{GRID_MM, RectangleSearch};
 use stack::{Stack, Window};
+use steps::Steps;
 use still::Still;
 
 pub use rectangle::Rectangle;
@@ -39,10 +40,8 @@ const WAIT_COLUMNS: usize = 8;
 const BESIDE_CELLS: usize = 6;
 /// A beginning of fewer cells is an accident.
 const CELLS_MIN: usize = 12;
-/// What is looked at around a beginning at first, and if that does not hold all sides, mm.
-const REACH_MM: [f64; 2] = [200.0, 420.0];
-/// The sides are all there from this share of the border on.
-const WHOLE_SUPPORT: f64 = 0.9;
+/// What is looked at around a beginning, mm.
+const REACH_MM: f64 = 420.0;
 /// A border with less than this share of edge is an accident.
 const SUPPORT_MIN: f64 = 0.65;
 /// Each side has at least this share of edge.
@@ -51,6 +50,8 @@ const SIDE_SUPPORT_MIN: f64 = 0.25;
 const ACCIDENT_SUPPORT: f64 = 0.55;
 /// Where the plane of the sharpest border is sought around the cells' height, mm, coarse and fine.
 const HEIGHT_OFFSETS_MM: [&[f64]; 2] = [&[-5.0, 5.0, -10.0, 10.0, -15.0, 15.0], &[-2.5, 2.5]];
+/// Times that the border is sought anew on the plane where it was sharpest.
+const LOOKS: usize = 2;
 /// What is looked at around a known border, mm.
 const NEAR_MM: f64 = 40.0;
 /// Cells this far around a face are its own: its sides, mm.
@@ -87,6 +88,7 @@ pub struct Parcels {
     cell_mm: f64,
     row_0_mm: f64,
     height_max_mm: f32,
+    steps: Steps,
     still: Still,
     stack: Stack,
     search: RectangleSearch,
@@ -98,10 +100,11 @@ pub struct Parcels {
 
 impl Parcels {
     /// Memory for a site.
-    pub fn plan(view: &BeltView, zone: &BeltRect, plan: &mut Plan) {
+    pub fn plan(view: &BeltView, zone: &BeltRect, height_max_mm: f64, plan: &mut Plan) {
+        Steps::plan(view, plan);
         Still::plan(view, plan);
-        Stack::plan(view, zone, plan);
-        RectangleSearch::plan(view, zone, plan);
+        Stack::plan(view, zone, height_max_mm, plan);
+        RectangleSearch::plan(zone, plan);
     }
 
     /// Nothing seen.
@@ -120,6 +123,7 @@ impl Parcels {
             cell_mm: evidence.side_mm(),
             row_0_mm: evidence.row_mm(0),
             height_max_mm: height_max_mm as f32,
+            steps: Steps::new(view, memory)?,
             still: Still::new(view, memory)?,
             stack: Stack::new(view, zone, memory)?,
             search: RectangleSearch::new(memory)?,
@@ -129,12 +133,20 @@ impl Parcels {
     }
 
     /// A view more. `seen`: bit mask of the view's pixels that the camera sees.
-    pub fn add(&mut self, grey: Plane<'_>, seen: &[u64]) {
-        self.still.add(grey, seen);
+    pub fn add(&mut self, views: &Views, place: usize, seen: &[u64]) {
+        self.steps.add(views.grey(place), seen, place);
+        self.still.add(self.steps.picture(place).grey);
     }
 
-    /// The faces whose trailing end has passed `end_mm`, X less the belt's travel.
-    pub fn passed(&mut self, evidence: &Evidence, views: &Views, end_mm: f64) -> Vec<Face> {
+    /// The faces whose trailing end has passed `end_mm`, X less the belt's travel. `is_raised`: whether a face
+    /// lies over the belt, by its edges; what lies on the belt itself carries no parcel as a stack does.
+    pub fn passed(
+        &mut self,
+        evidence: &Evidence,
+        views: &Views,
+        end_mm: f64,
+        is_raised: impl Fn(&Face) -> bool,
+    ) -> Vec<Face> {
         self.take_columns(evidence);
         let ended = end_mm == f64::NEG_INFINITY;
         for (members, height_mm) in self.beginnings(ended) {
@@ -146,7 +158,7 @@ impl Parcels {
             for &i in &members {
                 self.free[i] = false;
             }
-            if let Some(face) = found {
+            if let Some(face) = found.filter(&is_raised) {
                 self.claim(&face);
                 self.keep(&face);
             }
@@ -286,24 +298,17 @@ impl Parcels {
         let around = [extent(|place| place.0), extent(|place| place.1)];
         let inside = [middle_of(places.iter().map(|p| p.0)), middle_of(places.iter().map(|p| p.1))];
         let mut best = self.rectangle(views, height_mm, around, inside)?;
-        // The plane on which the border is sharpest.
         let mut top_mm = height_mm;
-        for offsets_mm in HEIGHT_OFFSETS_MM {
-            let from_mm = top_mm;
-            for offset_mm in offsets_mm {
-                let trial_mm = from_mm + offset_mm;
-                if !(f64::from(HEIGHT_MIN_MM)..f64::from(self.height_max_mm)).contains(&trial_mm) {
-                    continue;
-                }
-                self.fill(views, trial_mm, border_of(&best));
-                let middle = [best.x_mm as f32, best.y_mm as f32];
-                let found = self.search.near(&self.stack, middle, best.yaw as f32);
-                if let Some(found) = found.filter(|found| found.score_mm > best.score_mm) {
-                    (best, top_mm) = (found, trial_mm);
-                }
+        for _ in 0..LOOKS {
+            (best, top_mm) = self.sharpest(views, best, top_mm);
+            // On the right plane more of it may be sharp.
+            let wider = self.rectangle(views, top_mm, around, inside);
+            match wider.filter(|wider| wider.score_mm > best.score_mm + GRID_MM) {
+                Some(wider) => best = wider,
+                None => break,
             }
         }
-        self.fill(views, top_mm, border_of(&best));
+        self.fill(views, top_mm, border_of(&best, NEAR_MM));
         let narrower = self.search.narrower(&self.stack, &best);
         let weakest = best.sides.iter().copied().fold(1.0, f64::min);
         let is_face = best.support() >= SUPPORT_MIN && weakest >= SIDE_SUPPORT_MIN;
@@ -316,6 +321,27 @@ impl Parcels {
         })
     }
 
+    /// The plane on which a border is sharpest, and the border there.
+    fn sharpest(&mut self, views: &Views, border: Rectangle, height_mm: f64) -> (Rectangle, f64) {
+        let (mut best, mut top_mm) = (border, height_mm);
+        for offsets_mm in HEIGHT_OFFSETS_MM {
+            let from_mm = top_mm;
+            for offset_mm in offsets_mm {
+                let trial_mm = from_mm + offset_mm;
+                if !(f64::from(HEIGHT_MIN_MM)..f64::from(self.height_max_mm)).contains(&trial_mm) {
+                    continue;
+                }
+                self.fill(views, trial_mm, border_of(&best, NEAR_MM));
+                let middle = [best.x_mm as f32, best.y_mm as f32];
+                let found = self.search.near(&self.stack, middle, best.yaw as f32);
+                if let Some(found) = found.filter(|found| found.score_mm > best.score_mm) {
+                    (best, top_mm) = (found, trial_mm);
+                }
+            }
+        }
+        (best, top_mm)
+    }
+
     fn rectangle(
         &mut self,
         views: &Views,
@@ -324,24 +350,25 @@ impl Parcels {
         inside_mm: [f64; 2],
     ) -> Option<Rectangle> {
         let mut best: Option<Rectangle> = None;
-        for reach_mm in REACH_MM {
-            let wider = |[low, high]: [f64; 2]| [low - reach_mm, high + reach_mm];
-            self.fill(views, height_mm, [wider(x_mm), wider(y_mm)]);
+        let mut around = [x_mm, y_mm];
+        for _ in 0..LOOKS {
+            let window = around.map(|[low, high]| [low - REACH_MM, high + REACH_MM]);
+            self.fill(views, height_mm, window);
             let found = self.search.best(&self.stack, inside_mm.map(|mm| mm as f32));
-            if let Some(found) = found
-                && best.is_none_or(|best| found.score_mm > best.score_mm)
-            {
-                best = Some(found);
+            let score_mm = best.map_or(0.0, |best| best.score_mm + GRID_MM);
+            let Some(found) = found.filter(|found| found.score_mm > score_mm) else { break };
+            // What the window cut off may be seen from there.
+            for ([low, high], [from, to]) in around.iter_mut().zip(border_of(&found, 0.0)) {
+                (*low, *high) = (low.min(from), high.max(to));
             }
-            if best.is_some_and(|best| best.support() > WHOLE_SUPPORT) {
-                break;
-            }
+            best = Some(found);
         }
         best
     }
 
     fn fill(&mut self, views: &Views, height_mm: f64, [x_mm, y_mm]: [[f64; 2]; 2]) {
-        self.stack.fill(views, self.still.usable(), &Window { height_mm, x_mm, y_mm });
+        let window = Window { height_mm, x_mm, y_mm };
+        self.stack.fill(views, &self.steps, self.still.usable(), &window);
     }
 
     /// The cells of a face are free no more.
@@ -390,11 +417,11 @@ fn stacked(one: &Face, other: &Face) -> Option<Face> {
     on_top.then_some(Face { height_mm: high.height_mm, stacked: true, ..*low })
 }
 
-/// The surroundings of a rectangle: x and y, lowest and highest.
-fn border_of(rectangle: &Rectangle) -> [[f64; 2]; 2] {
+/// A rectangle's extent and a margin: x and y, lowest and highest.
+fn border_of(rectangle: &Rectangle, margin_mm: f64) -> [[f64; 2]; 2] {
     let (sin, cos) = rectangle.yaw.sin_cos();
     let y_reach_mm = 0.5 * (rectangle.length_mm * sin.abs() + rectangle.width_mm * cos.abs());
-    let around = |middle: f64, reach: f64| [middle - reach - NEAR_MM, middle + reach + NEAR_MM];
+    let around = |middle: f64, reach: f64| [middle - reach - margin_mm, middle + reach + margin_mm];
     [around(rectangle.x_mm, rectangle.reach_mm()), around(rectangle.y_mm, y_reach_mm)]
 }
 

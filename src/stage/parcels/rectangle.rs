@@ -6,8 +6,7 @@
 //! neighbour) costs more than it brings. Tried is every combination of the most promising lines, for
 //! the directions that most edges have.
 
-use super::stack::Stack;
-use crate::camera::BeltView;
+use super::stack::{Stack, WINDOW_MAX_MM};
 use crate::error::Result;
 use crate::plan::{Block, Memory, Plan};
 use crate::units::BeltRect;
@@ -38,6 +37,8 @@ const APART_MM: f64 = 6.0;
 const NARROWER_SHARE: f64 = 0.4;
 /// ... if it is edge for this share of what the side is.
 const NEARLY: f64 = 0.75;
+/// Side of the turned grid's cells, mm, if the stack's pixels are not larger.
+pub const GRID_MM: f64 = 2.0;
 /// Sides shorter than this are no parcel, mm.
 const SIDE_MIN_MM: f64 = 12.0;
 
@@ -148,15 +149,16 @@ const WHOLE: u8 = 8;
 
 impl RectangleSearch {
     /// Memory for the largest window turned by 45 degrees.
-    pub fn plan(view: &BeltView, zone: &BeltRect, plan: &mut Plan) {
-        let n = Self::cells_max(view, zone);
+    pub fn plan(zone: &BeltRect, plan: &mut Plan) {
+        let n = Self::cells_max(zone);
         plan.add::<[u8; 2]>("rectangle.grid", n, "edge pixels along a direction");
         plan.add::<i32>("rectangle.down", n, "their sums down the columns");
         plan.add::<i32>("rectangle.along", n, "their sums along the rows");
     }
 
-    fn cells_max(view: &BeltView, zone: &BeltRect) -> usize {
-        let (columns, rows) = Stack::sides_max_px(view, zone);
+    fn cells_max(zone: &BeltRect) -> usize {
+        let count = |mm: f64| (mm.min(WINDOW_MAX_MM) / GRID_MM).ceil() as usize;
+        let (columns, rows) = (count(WINDOW_MAX_MM), count(zone.y_max_mm - zone.y_min_mm));
         let side = columns + rows + 2 * usize::from(MARGIN);
         side * side / 2 + 2 * side
     }
@@ -303,7 +305,7 @@ impl RectangleSearch {
     /// The edge pixels in a grid turned by `yaw`, each as wide as two pixels across its side.
     fn turn(&mut self, stack: &Stack, yaw: f32) -> Option<Turned> {
         let (sin, cos) = yaw.sin_cos();
-        let px_mm = stack.px_mm() as f32;
+        let px_mm = grid_mm(stack) as f32;
         let [mut low, mut high] = [[f32::INFINITY; 2], [f32::NEG_INFINITY; 2]];
         for edge in stack.edges() {
             let [x, y] = edge.at_mm;
@@ -368,6 +370,11 @@ impl RectangleSearch {
             }
         }
     }
+}
+
+/// Side of the grid's cells, mm: [`GRID_MM`], or a pixel of the stack.
+fn grid_mm(stack: &Stack) -> f64 {
+    stack.px_mm().max(GRID_MM)
 }
 
 /// Pixels around the edges in the turned grid.

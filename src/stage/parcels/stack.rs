@@ -5,19 +5,16 @@
 //! (semblance), beyond what noise does there, and not part of a slow ramp: a shadow's soft border is
 //! as wide as its displacement and would look alike at every height.
 
+use super::steps::{STEP_ONE, StepPicture, Steps};
 use crate::camera::BeltView;
 use crate::error::Result;
-use crate::kernel::scalar::bits::{self, words};
-use crate::kernel::scalar::box_filter::{self, box_filter};
 use crate::plan::{Block, Memory, Plan};
 use crate::stage::evidence::DARK_GREY;
 use crate::stage::views::Views;
 use crate::units::BeltRect;
 
-/// Pixels of the stack, about: coarser than the fit's, finer than any gap that matters.
-const PX_MM: f64 = 2.0;
 /// A window's sides at most, mm: the longest parcel, with its surroundings.
-const WINDOW_MAX_MM: f64 = 1000.0;
+pub const WINDOW_MAX_MM: f64 = 1000.0;
 /// A step's share that is the same in all views.
 const SEMBLANCE_MIN: f32 = 0.4;
 /// From this share on the views agree wholly: focus is exact to a pixel or two over the pass.
@@ -27,16 +24,14 @@ const STEP_SIGMA_MIN: f32 = 4.0;
 /// ... and at least this, as a logarithm: 1 %.
 const STEP_MIN: f32 = 0.012;
 /// Fewer views than this agree by accident.
-const VIEWS_MIN: f32 = 6.0;
-/// A step is told with this many pixels to either side.
-const REACH_PX: usize = 2 * box_filter::REACH + 1;
+const VIEWS_MIN: u16 = 6;
 /// Classes of brightness in which noise is told, each this wide (logarithm), ...
 const CLASS_LOG: f32 = 0.15;
 /// ... from 0 + [`DARK_GREY`] to 255.
 const CLASSES: usize = 28;
 /// Noise is told from the quietest quarter of the pixels of a brightness.
 const QUIET_SHARE: f32 = 0.25;
-/// Bins of the logarithm of energy, four to a factor of two, from 2^-24 on.
+/// Bins of energy, four to a factor of two, from 2^-24 on.
 const ENERGY_BINS: usize = 128;
 
 /// A part of the plane z = `height_mm`, belt-fixed: X less the belt's travel.
@@ -63,79 +58,73 @@ pub struct EdgePixel {
     pub agreement: f32,
 }
 
-/// Sums over the views.
-#[derive(Clone, Copy, Default)]
-struct Sums {
-    /// Step along X and Y.
-    step: [f32; 2],
-    /// Its squared length.
-    energy: f32,
-    /// Logarithm of the grey value.
-    log: f32,
-    views: f32,
-}
-
 /// The stack of one window at a time.
 pub struct Stack {
     geometry: BeltView,
     zone: BeltRect,
+    /// Pixels of the view to a side of a picture's, and the pictures' size.
+    side_px: usize,
+    picture_px: [usize; 2],
+    /// Side of a pixel on the window's plane.
     px_mm: f64,
     columns: usize,
     rows: usize,
     origin_mm: [f64; 2],
     /// Logarithm of the grey values 0 to 255.
     log_of: [f32; 256],
-    log: Block<f32>,
-    slow: Block<f32>,
-    sums: Block<Sums>,
+    /// Sums over the views: steps, their squared length, grey values, and how many views.
+    steps: Block<[i16; 2]>,
+    energy: Block<i32>,
+    grey: Block<u16>,
+    views: Block<u16>,
     edges: Block<EdgePixel>,
     edge_count: usize,
 }
 
-fn sides_max(view: &BeltView, zone: &BeltRect) -> (f64, usize, usize) {
-    let px_mm = PX_MM.max(view.mm_per_px);
-    let columns = (WINDOW_MAX_MM / px_mm).ceil() as usize;
-    let rows = ((zone.y_max_mm - zone.y_min_mm).min(WINDOW_MAX_MM) / px_mm).ceil() as usize;
-    (px_mm, columns, rows)
+/// Pixels of the largest window along and across, and their side on the belt, mm.
+fn sizes(view: &BeltView, zone: &BeltRect, height_max_mm: f64) -> (f64, [usize; 2]) {
+    let (side_px, _) = Steps::sizes(view);
+    let px_mm = side_px as f64 * view.mm_per_px;
+    let least_mm = px_mm / view.magnification(height_max_mm);
+    let count = |length_mm: f64| (length_mm.min(WINDOW_MAX_MM) / least_mm).ceil() as usize;
+    (px_mm, [count(WINDOW_MAX_MM), count(zone.y_max_mm - zone.y_min_mm)])
 }
 
 impl Stack {
-    /// Memory for a view and a zone.
-    pub fn plan(view: &BeltView, zone: &BeltRect, plan: &mut Plan) {
-        let (_, columns, rows) = sides_max(view, zone);
+    /// Memory for a site.
+    pub fn plan(view: &BeltView, zone: &BeltRect, height_max_mm: f64, plan: &mut Plan) {
+        let (_, [columns, rows]) = sizes(view, zone, height_max_mm);
         let n = columns * rows;
-        plan.add::<f32>("stack.log", n, "one view on a plane");
-        plan.add::<f32>("stack.slow", n, "its slow part");
-        plan.add::<Sums>("stack.sums", n, "steps and energies over the views");
+        plan.add::<[i16; 2]>("stack.steps", n, "a window's steps, summed over the views");
+        plan.add::<i32>("stack.energy", n, "their squares");
+        plan.add::<u16>("stack.grey", n, "its grey values");
+        plan.add::<u16>("stack.views", n, "how many views show it");
         plan.add::<EdgePixel>("stack.edges", n, "edge pixels of a plane");
     }
 
     /// Nothing stacked.
     pub fn new(view: &BeltView, zone: &BeltRect, memory: &mut Memory) -> Result<Self> {
-        let (px_mm, columns, rows) = sides_max(view, zone);
+        let (side_px, picture_px) = Steps::sizes(view);
         Ok(Self {
             geometry: view.clone(),
             zone: *zone,
-            px_mm,
-            columns,
-            rows,
+            side_px,
+            picture_px,
+            px_mm: side_px as f64 * view.mm_per_px,
+            columns: 0,
+            rows: 0,
             origin_mm: [0.0; 2],
             log_of: std::array::from_fn(|grey| (grey as f32 + DARK_GREY).ln()),
-            log: memory.take("stack.log", 0.0)?,
-            slow: memory.take("stack.slow", 0.0)?,
-            sums: memory.take("stack.sums", Sums::default())?,
+            steps: memory.take("stack.steps", [0; 2])?,
+            energy: memory.take("stack.energy", 0)?,
+            grey: memory.take("stack.grey", 0)?,
+            views: memory.take("stack.views", 0)?,
             edges: memory.take("stack.edges", EdgePixel::default())?,
             edge_count: 0,
         })
     }
 
-    /// The largest window, pixels along and across.
-    pub fn sides_max_px(view: &BeltView, zone: &BeltRect) -> (usize, usize) {
-        let (_, columns, rows) = sides_max(view, zone);
-        (columns, rows)
-    }
-
-    /// Side of a pixel, mm.
+    /// Side of the window's pixels, mm.
     pub fn px_mm(&self) -> f64 {
         self.px_mm
     }
@@ -154,126 +143,72 @@ impl Stack {
         inside
             && column < self.columns
             && row < self.rows
-            && self.sums[row * self.columns + column].views >= VIEWS_MIN
+            && self.views[row * self.columns + column] >= VIEWS_MIN
     }
 
-    /// Stack the views on a window, cut to the zone's width and to what there is memory for.
-    pub fn fill(&mut self, views: &Views, seen: &[u64], window: &Window) {
-        let (_, columns_max, rows_max) = sides_max(&self.geometry, &self.zone);
+    /// Stack the views on a window, cut to the zone's width and to what there is memory for. `usable`: of a
+    /// picture's pixels, those that tell of the belt.
+    pub fn fill(&mut self, views: &Views, steps: &Steps, usable: &[bool], window: &Window) {
+        let m = self.geometry.magnification(window.height_mm);
+        self.px_mm = self.side_px as f64 * self.geometry.mm_per_px / m;
         let y_max_mm = window.y_mm[1].min(self.zone.y_max_mm);
         let y_min_mm = window.y_mm[0].max(self.zone.y_min_mm);
         let count = |length_mm: f64| (length_mm / self.px_mm).ceil().max(1.0) as usize;
+        let columns_max = count(WINDOW_MAX_MM).min(self.views.len());
         self.columns = count(window.x_mm[1] - window.x_mm[0]).min(columns_max);
-        self.rows = count(y_max_mm - y_min_mm).min(rows_max);
+        self.rows = count(y_max_mm - y_min_mm).min(self.views.len() / self.columns);
         self.origin_mm = [window.x_mm[0], y_max_mm];
-        self.sums[..self.columns * self.rows].fill(Sums::default());
+        let n = self.columns * self.rows;
+        self.steps[..n].fill([0; 2]);
+        self.energy[..n].fill(0);
+        self.grey[..n].fill(0);
+        self.views[..n].fill(0);
         for place in views.places() {
             let travel_mm = views.kept(place).at.travel_mm;
             let (first_mm, last_mm) = (window.x_mm[0] + travel_mm, window.x_mm[1] + travel_mm);
             if last_mm > self.zone.x_min_mm && first_mm < self.zone.x_max_mm {
-                let columns = self.project(views, place, seen, window.height_mm);
-                self.add(columns);
+                self.add(steps.picture(place), usable, travel_mm, m);
             }
         }
         self.find_edges();
     }
 
-    /// One view on the plane: logarithms, NaN where it is not seen. Returns the columns in the zone.
-    fn project(
-        &mut self,
-        views: &Views,
-        place: usize,
-        seen: &[u64],
-        height_mm: f64,
-    ) -> std::ops::Range<usize> {
-        let (grey, view) = (views.grey(place), &self.geometry);
-        let travel_mm = views.kept(place).at.travel_mm;
-        let m = view.magnification(height_mm);
-        let step_px = m * self.px_mm / view.mm_per_px;
+    /// Add one view: on the plane its pixels are the window's, moved by whole pixels to the nearest.
+    fn add(&mut self, picture: StepPicture<'_>, usable: &[bool], travel_mm: f64, m: f64) {
+        let view = &self.geometry;
         let x_mm = view.nadir.x + m * (self.origin_mm[0] + travel_mm - view.nadir.x);
         let y_mm = view.nadir.y + m * (self.origin_mm[1] - view.nadir.y);
-        let u0 = (x_mm - view.origin.x) / view.mm_per_px;
-        let v0 = (view.origin.y - y_mm) / view.mm_per_px;
-        let [width, height] = view.size_px;
+        // The middle of the pictures' first pixel.
+        let middle_px = 0.5 * (self.side_px as f64 - 1.0);
+        let at = |px: f64| ((px - middle_px) / self.side_px as f64).round() as i64;
+        let i0 = at((x_mm - view.origin.x) / view.mm_per_px);
+        let j0 = at((view.origin.y - y_mm) / view.mm_per_px);
+        let [width, height] = self.picture_px.map(|px| px as i64);
         // In the zone and in the picture.
         let in_zone = [self.zone.x_min_mm, self.zone.x_max_mm]
             .map(|mm| (mm - travel_mm - self.origin_mm[0]) / self.px_mm);
-        let in_view = [-u0 / step_px, ((width - 2) as f64 - u0) / step_px];
-        let first = in_zone[0].max(in_view[0]).ceil().max(0.0) as usize;
-        let end =
-            (in_zone[1].min(in_view[1]).floor() + 1.0).clamp(0.0, self.columns as f64) as usize;
-        let columns = first.min(end)..end;
-        let n = words(width);
-        for row in 0..self.rows {
-            let log = &mut self.log[row * self.columns..][..self.columns];
-            let v = v0 + row as f64 * step_px;
-            if v < 0.0 || v >= (height - 1) as f64 {
-                log[columns.clone()].fill(f32::NAN);
-                continue;
-            }
-            let (j, fv) = (v as usize, v.fract() as f32);
-            let (above, below, seen) = (grey.row(j), grey.row(j + 1), &seen[j * n..][..n]);
-            let mut u = u0 + columns.start as f64 * step_px;
-            for out in &mut log[columns.clone()] {
-                let (i, fu) = (u as usize, (u - u.floor()) as f32);
-                *out = if bits::get(seen, i) {
-                    let [a, b, c, d] = [above[i], above[i + 1], below[i], below[i + 1]]
-                        .map(|grey| self.log_of[usize::from(grey)]);
-                    let (top, bottom) = (a + fu * (b - a), c + fu * (d - c));
-                    top + fv * (bottom - top)
-                } else {
-                    f32::NAN
-                };
-                u += step_px;
-            }
-        }
-        columns
-    }
-
-    /// Add the steps of the view just projected.
-    fn add(&mut self, columns: std::ops::Range<usize>) {
-        let (width, rows) = (self.columns, self.rows);
-        if columns.len() <= 2 * REACH_PX || rows <= 2 * REACH_PX {
+        let first = (in_zone[0].ceil() as i64).max(-i0).max(0);
+        let end = (in_zone[1].floor() as i64 + 1).min(width - i0).min(self.columns as i64);
+        if first >= end {
             return;
         }
-        // `log` becomes the fine part where all of its surroundings are seen, `slow` is scratch.
-        self.take_out_the_slow_part(&columns);
-        for row in REACH_PX..rows - REACH_PX {
-            for column in columns.start + REACH_PX..columns.end - REACH_PX {
-                let i = row * width + column;
-                let fine = &self.log;
-                let dx = fine[i + 1] - fine[i - 1];
-                let dy = fine[i - width] - fine[i + width];
-                let energy = dx * dx + dy * dy;
-                if energy.is_nan() {
-                    continue;
-                }
-                let sums = &mut self.sums[i];
-                sums.step[0] += dx;
-                sums.step[1] += dy;
-                sums.energy += energy;
-                sums.log += fine[i] + self.slow[i];
-                sums.views += 1.0;
+        for row in 0..self.rows as i64 {
+            let j = j0 + row;
+            if !(0..height).contains(&j) {
+                continue;
             }
-        }
-    }
-
-    fn take_out_the_slow_part(&mut self, columns: &std::ops::Range<usize>) {
-        let (width, rows) = (self.columns, self.rows);
-        self.slow[..rows * width].copy_from_slice(&self.log[..rows * width]);
-        for _ in 0..2 {
-            for row in 0..rows {
-                let line = &mut self.slow[row * width + columns.start..];
-                box_filter(line, 1, columns.len());
-            }
-            for column in columns.clone() {
-                box_filter(&mut self.slow[column..], width, rows);
-            }
-        }
-        for row in 0..rows {
-            for i in row * width + columns.start..row * width + columns.end {
-                self.log[i] -= self.slow[i];
-            }
+            let from = (j * width + i0 + first) as usize..(j * width + i0 + end) as usize;
+            let to = row as usize * self.columns + first as usize
+                ..row as usize * self.columns + end as usize;
+            add_row(
+                &picture.steps[from.clone()],
+                &picture.grey[from.clone()],
+                &usable[from],
+                &mut self.steps[to.clone()],
+                &mut self.energy[to.clone()],
+                &mut self.grey[to.clone()],
+                &mut self.views[to],
+            );
         }
     }
 
@@ -282,13 +217,14 @@ impl Stack {
         self.edge_count = 0;
         for row in 0..self.rows {
             for column in 0..self.columns {
-                let Sums { step: [x, y], energy, log, views: n } =
-                    self.sums[row * self.columns + column];
-                if n < VIEWS_MIN {
+                let i = row * self.columns + column;
+                if self.views[i] < VIEWS_MIN {
                     continue;
                 }
-                let (x, y, energy) = (x / n, y / n, energy / n);
-                let noise = noise_at(&noise, log / n);
+                let n = f32::from(self.views[i]);
+                let [x, y] = self.steps[i].map(|sum| f32::from(sum) / (n * STEP_ONE));
+                let energy = self.energy[i] as f32 / (n * STEP_ONE * STEP_ONE);
+                let noise = noise_at(&noise, self.log_at(i));
                 let common = x * x + y * y;
                 let semblance = (common - noise / n) / (energy - noise).max(0.15 * energy);
                 let beyond_noise = common * n > STEP_SIGMA_MIN * STEP_SIGMA_MIN * noise;
@@ -311,14 +247,19 @@ impl Stack {
         }
     }
 
+    /// Logarithm of a pixel's mean grey value.
+    fn log_at(&self, i: usize) -> f32 {
+        self.log_of[usize::from(self.grey[i] / self.views[i]).min(255)]
+    }
+
     /// Energy of noise in each class of brightness.
     fn noise(&self) -> [f32; CLASSES] {
         let mut counts = [[0u32; ENERGY_BINS]; CLASSES];
-        for &Sums { energy, log, views: n, .. } in &self.sums[..self.columns * self.rows] {
-            if n >= VIEWS_MIN {
-                let bin = 4.0 * ((energy / n).max(1e-9).log2() + 24.0);
-                let bin = (bin.max(0.0) as usize).min(ENERGY_BINS - 1);
-                counts[class_of(log / n) as usize][bin] += 1;
+        for i in 0..self.columns * self.rows {
+            if self.views[i] >= VIEWS_MIN {
+                let energy =
+                    self.energy[i] as f32 / (f32::from(self.views[i]) * STEP_ONE * STEP_ONE);
+                counts[class_of(self.log_at(i)) as usize][energy_bin(energy)] += 1;
             }
         }
         let mut noise = counts.map(|counts| {
@@ -332,8 +273,7 @@ impl Stack {
                 below += count;
                 below > quiet
             };
-            let bin = counts.iter().position(within).unwrap_or(0);
-            (0.25 * (bin as f32 + 0.5) - 24.0).exp2()
+            energy_of(counts.iter().position(within).unwrap_or(0))
         });
         for classes in [1..CLASSES, 1..CLASSES] {
             for class in classes {
@@ -345,6 +285,45 @@ impl Stack {
         }
         noise.map(|noise| if noise.is_nan() { 0.0 } else { noise })
     }
+}
+
+/// Add a view's pixels to the sums.
+fn add_row(
+    steps: &[[i8; 2]],
+    grey: &[u8],
+    usable: &[bool],
+    step_sums: &mut [[i16; 2]],
+    energies: &mut [i32],
+    grey_sums: &mut [u16],
+    views: &mut [u16],
+) {
+    let sums = step_sums.iter_mut().zip(energies).zip(grey_sums).zip(views);
+    for (((step, (&grey, &usable)), ((step_sum, energy), grey_sum)), views) in steps
+        .iter()
+        .zip(grey.iter().zip(usable))
+        .zip(sums)
+        .map(|(from, (to, views))| ((from, to), views))
+    {
+        let counts = i16::from(usable & (grey > 0));
+        let [x, y] = step.map(|step| counts * i16::from(step));
+        step_sum[0] += x;
+        step_sum[1] += y;
+        *energy += i32::from(x) * i32::from(x) + i32::from(y) * i32::from(y);
+        *grey_sum += counts as u16 * u16::from(grey);
+        *views += counts as u16;
+    }
+}
+
+/// Bin of an energy: quarters of an octave, by the number's own bits.
+fn energy_bin(energy: f32) -> usize {
+    const FIRST: i32 = (127 - 24) << 2;
+    ((energy.to_bits() >> 21) as i32 - FIRST).clamp(0, ENERGY_BINS as i32 - 1) as usize
+}
+
+/// The middle of a bin.
+fn energy_of(bin: usize) -> f32 {
+    let octave = (bin / 4) as f32 - 24.0;
+    octave.exp2() * (1.0 + 0.25 * ((bin % 4) as f32 + 0.5))
 }
 
 fn class_of(log: f32) -> f32 {

@@ -1,0 +1,181 @@
+//! Steps of the views' logarithm, without its slow part: what the stacks add up.
+//!
+//! In: the views kept. Out: for each a picture of steps, taken once, when the view comes. A shadow's factor
+//! drops out of a logarithm's step, and its soft border is part of what is slow.
+
+use crate::camera::BeltView;
+use crate::error::Result;
+use crate::image::Plane;
+use crate::kernel::scalar::bits::{self, words};
+use crate::kernel::scalar::box_filter::{self, box_filter};
+use crate::plan::{Block, Memory, Plan};
+use crate::stage::evidence::DARK_GREY;
+use crate::stage::views::VIEWS_MAX;
+
+/// Side of a picture's pixel, mm, about: coarser than the fit's, finer than any gap that matters.
+const PX_MM: f64 = 2.0;
+/// A step of 1 in the logarithm, in units of a stored one.
+pub const STEP_ONE: f32 = 256.0;
+/// The longest step that is stored; longer ones keep their direction.
+const STEP_MOST: f32 = 127.0;
+
+/// The steps of one view.
+#[derive(Clone, Copy)]
+pub struct StepPicture<'a> {
+    /// Along X and along Y, from dark to bright, in units of 1 / [`STEP_ONE`].
+    pub steps: &'a [[i8; 2]],
+    /// Grey values; 0: not known.
+    pub grey: &'a [u8],
+}
+
+/// The stage.
+pub struct Steps {
+    /// Pixels of the view to a side of a picture's.
+    side_px: usize,
+    view_px: [usize; 2],
+    size_px: [usize; 2],
+    /// Logarithm of the grey values 0 to 255.
+    log_of: [f32; 256],
+    log: Block<f32>,
+    slow: Block<f32>,
+    steps: Block<[i8; 2]>,
+    grey: Block<u8>,
+}
+
+/// Pixels of the view to a side of a picture's, and the picture's size.
+fn sizes(view: &BeltView) -> (usize, [usize; 2]) {
+    let side_px = (PX_MM / view.mm_per_px).round().max(1.0) as usize;
+    (side_px, view.size_px.map(|px| (px / side_px).max(1)))
+}
+
+impl Steps {
+    /// Memory for a view.
+    pub fn plan(view: &BeltView, plan: &mut Plan) {
+        let (_, [width, height]) = sizes(view);
+        let n = width * height;
+        plan.add::<f32>("steps.log", n, "logarithm of one view");
+        plan.add::<f32>("steps.slow", n, "its slow part");
+        plan.add::<[i8; 2]>("steps.steps", n * VIEWS_MAX, "steps of each view kept");
+        plan.add::<u8>("steps.grey", n * VIEWS_MAX, "grey values to them");
+    }
+
+    /// None yet.
+    pub fn new(view: &BeltView, memory: &mut Memory) -> Result<Self> {
+        let (side_px, size_px) = sizes(view);
+        Ok(Self {
+            side_px,
+            view_px: view.size_px,
+            size_px,
+            log_of: std::array::from_fn(|grey| (grey as f32 + DARK_GREY).ln()),
+            log: memory.take("steps.log", 0.0)?,
+            slow: memory.take("steps.slow", 0.0)?,
+            steps: memory.take("steps.steps", [0; 2])?,
+            grey: memory.take("steps.grey", 0)?,
+        })
+    }
+
+    /// Pixels of the view to a side of a picture's, and the picture's size.
+    pub fn sizes(view: &BeltView) -> (usize, [usize; 2]) {
+        sizes(view)
+    }
+
+    /// The steps of the view at a place.
+    pub fn picture(&self, place: usize) -> StepPicture<'_> {
+        let n = self.size_px[0] * self.size_px[1];
+        StepPicture { steps: &self.steps[place * n..][..n], grey: &self.grey[place * n..][..n] }
+    }
+
+    /// A view more. `seen`: bit mask of the view's pixels that the camera sees.
+    pub fn add(&mut self, grey: Plane<'_>, seen: &[u64], place: usize) {
+        self.take_logarithms(grey, seen, place);
+        self.find_slow_part();
+        let [width, height] = self.size_px;
+        for (log, slow) in self.log.iter_mut().zip(self.slow.iter()) {
+            *log -= slow;
+        }
+        let n = width * height;
+        let steps = &mut self.steps[place * n..][..n];
+        let grey = &mut self.grey[place * n..][..n];
+        steps.fill([0; 2]);
+        for j in 0..height {
+            for i in 0..width {
+                let at = j * width + i;
+                let inside = i > 0 && j > 0 && i + 1 < width && j + 1 < height;
+                let step = inside.then(|| {
+                    let fine = &self.log;
+                    [fine[at + 1] - fine[at - 1], fine[at - width] - fine[at + width]]
+                });
+                match step.and_then(stored) {
+                    Some(step) => steps[at] = step,
+                    None => grey[at] = 0,
+                }
+            }
+        }
+    }
+
+    /// Means over a picture's pixel, and their logarithms; NaN where one is not seen.
+    fn take_logarithms(&mut self, grey: Plane<'_>, seen: &[u64], place: usize) {
+        let ([width, height], side) = (self.size_px, self.side_px);
+        let n = words(self.view_px[0]);
+        for j in 0..height {
+            for i in 0..width {
+                let (mut sum, mut unseen) = (0u32, false);
+                for v in j * side..(j + 1) * side {
+                    let row = grey.row(v);
+                    for u in i * side..(i + 1) * side {
+                        sum += u32::from(row[u]);
+                        unseen |= !bits::get(&seen[v * n..][..n], u);
+                    }
+                }
+                let at = j * width + i;
+                let mean = sum as f32 / (side * side) as f32;
+                self.grey[place * width * height + at] = (mean as u8).max(1);
+                self.log[at] = match (unseen, side) {
+                    (true, _) => f32::NAN,
+                    (false, 1) => self.log_of[sum as usize],
+                    (false, _) => (mean + DARK_GREY).ln(),
+                };
+            }
+        }
+    }
+
+    fn find_slow_part(&mut self) {
+        let [width, height] = self.size_px;
+        self.slow.copy_from_slice(&self.log);
+        for _ in 0..PASSES {
+            for line in self.slow.chunks_exact_mut(width) {
+                box_filter(line, 1, width);
+            }
+            for column in 0..width {
+                box_filter(&mut self.slow[column..], width, height);
+            }
+        }
+    }
+}
+
+/// So far the slow part spreads an edge.
+pub const REACH_PX: usize = PASSES * box_filter::REACH;
+/// Times that the box filter is applied.
+const PASSES: usize = 2;
+
+fn stored([x, y]: [f32; 2]) -> Option<[i8; 2]> {
+    let length = STEP_ONE * x.hypot(y);
+    if length.is_nan() {
+        return None;
+    }
+    let scale = STEP_ONE * (STEP_MOST / length.max(STEP_MOST));
+    Some([x, y].map(|step| (scale * step).round() as i8))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_step_is_stored_with_its_direction_however_long_and_what_is_unknown_is_none() {
+        assert_eq!(stored([0.1, -0.2]), Some([26, -51]));
+        let [x, y] = stored([3.0, 4.0]).expect("known");
+        assert_eq!([x, y], [76, 102], "of length 127");
+        assert_eq!(stored([f32::NAN, 0.0]), None);
+    }
+}
