@@ -5,6 +5,7 @@ use beltgauge::camera::chessboard::Chessboard;
 use beltgauge::config::Site;
 use beltgauge::error::{Error, Result};
 use beltgauge::event::ParcelRecord;
+use beltgauge::run::archive::{self, Export};
 use beltgauge::run::board;
 use beltgauge::run::budget::{self, StraightDown};
 use beltgauge::run::calibrate::{self, DataSheet};
@@ -67,6 +68,9 @@ enum Command {
         /// Address and port of the Modbus server [default: 0.0.0.0:1502].
         #[arg(long)]
         listen: Option<SocketAddr>,
+        /// Address and port of the page [default: 0.0.0.0:8080].
+        #[arg(long)]
+        page: Option<SocketAddr>,
         /// File with tables of a configuration that replace the demo's own, for example [can].
         #[arg(long)]
         config: Option<PathBuf>,
@@ -124,6 +128,14 @@ enum Command {
         #[arg(long, default_value = STORE)]
         store: PathBuf,
     },
+    /// What was seen: parcels with their pictures, and events.
+    Archive {
+        #[command(subcommand)]
+        what: Archive,
+        /// The archive's folder [default: that of an appliance].
+        #[arg(long, global = true)]
+        folder: Option<PathBuf>,
+    },
     /// Do what inserting a USB stick does: put its configuration in force.
     Import {
         /// The stick: a folder with a folder `beltgauge` in it.
@@ -162,6 +174,30 @@ enum Command {
 
 /// Where an appliance keeps its configurations.
 const STORE: &str = "/var/lib/beltgauge";
+
+#[derive(Subcommand)]
+enum Archive {
+    /// Print the last entries, newest first.
+    List {
+        /// How many.
+        #[arg(long, default_value_t = 20)]
+        last: usize,
+    },
+    /// Write all entries for other programs.
+    Export {
+        /// Parcels, a line each.
+        #[arg(long)]
+        csv: Option<PathBuf>,
+        /// All entries, a line of JSON each.
+        #[arg(long)]
+        jsonl: Option<PathBuf>,
+        /// Folder for the pictures, named by the numbers of their entries.
+        #[arg(long)]
+        pictures: Option<PathBuf>,
+    },
+    /// Say whether it is as it was written.
+    Verify,
+}
 
 #[derive(clap::Args)]
 struct Budget {
@@ -362,9 +398,10 @@ impl Observer for Console {
 
 fn dispatch(command: Command) -> Result<()> {
     match command {
-        Command::Demo { seconds, out, listen, config, record } => {
+        Command::Demo { seconds, out, listen, page, config, record } => {
             let (config, record) = (config.as_deref(), record.as_deref());
-            let table = demo::run(demo::Options { seconds, out: &out, listen, config, record })?;
+            let options = demo::Options { seconds, out: &out, listen, page, config, record };
+            let table = demo::run(options)?;
             print(format_args!("{table}\npictures and records are in {}", out.display()))
         }
         Command::Measure { input, config, fps, jsonl, annotate, explain, inject } => {
@@ -396,6 +433,19 @@ fn dispatch(command: Command) -> Result<()> {
             watchdog: watchdog.as_deref(),
             record: record.as_deref(),
         }),
+        Command::Archive { what, folder } => {
+            let folder = folder.unwrap_or_else(|| Store::new(Path::new(STORE)).archive());
+            let report = match what {
+                Archive::List { last } => archive::list(&folder, last)?,
+                Archive::Export { csv, jsonl, pictures } => {
+                    let (csv, jsonl) = (csv.as_deref(), jsonl.as_deref());
+                    let pictures = pictures.as_deref();
+                    archive::export(&folder, Export { csv, jsonl, pictures })?
+                }
+                Archive::Verify => archive::verify(&folder)?,
+            };
+            print(format_args!("{}", report.trim_end()))
+        }
         Command::Import { dir, store, .. } => {
             let store = Store::new(&store);
             let report = match dir {

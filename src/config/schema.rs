@@ -1,6 +1,7 @@
 //! The keys of the configuration file, their defaults and ranges.
 
 use super::plc::{Can, Encoder, Modbus, Plc};
+use super::service::{Archive, Web};
 use crate::error::{Error, Result};
 use crate::units::BeltRect;
 use minisign_verify::PublicKey;
@@ -53,6 +54,12 @@ pub struct Config {
     /// `[import]`
     #[serde(default)]
     pub import: Import,
+    /// `[web]`
+    #[serde(default)]
+    pub web: Web,
+    /// `[archive]`
+    #[serde(default)]
+    pub archive: Archive,
 }
 
 /// How a live camera is reached.
@@ -336,6 +343,8 @@ impl Config {
             can,
             encoder,
             import,
+            web,
+            archive,
         } = self;
         camera.check()?;
         for (key, mm) in [
@@ -400,6 +409,8 @@ impl Config {
         can.check()?;
         encoder.check()?;
         check_writers(plc, modbus, can, encoder)?;
+        web.check()?;
+        archive.check()?;
         import.public_key.as_deref().map_or(Ok(()), |key| public_key(key).map(drop))
     }
 }

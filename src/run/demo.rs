@@ -18,6 +18,9 @@ const CONFIG: &str = include_str!("../../config/demo/beltgauge.toml");
 const RECORDING: &str = "recording.y4m";
 /// A record belongs to the parcel whose true centre is this near.
 const MATCH_MM: f64 = 60.0;
+/// Folder of the archive in that of the results, and what it may take of the disk.
+const ARCHIVE: &str = "archive";
+const ARCHIVE_MIB_MAX: usize = 256;
 /// The console line is renewed this often.
 const CONSOLE_PERIOD: Duration = Duration::from_millis(200);
 
@@ -30,6 +33,8 @@ pub struct Options<'a> {
     pub out: &'a Path,
     /// Where the Modbus server listens; default: the demo configuration's port 1502.
     pub listen: Option<SocketAddr>,
+    /// Where the page is served; default: the demo configuration's port 8080.
+    pub page: Option<SocketAddr>,
     /// File with other tables of a configuration, for example `[can]`.
     pub config: Option<&'a Path>,
     /// Folder for a recording, and all that measuring it again and calibrating its camera needs.
@@ -81,6 +86,13 @@ pub fn run(options: Options<'_>) -> Result<String> {
     if let Some(listen) = options.listen {
         site.config.modbus.listen = listen;
     }
+    if let Some(page) = options.page {
+        (site.config.web.address, site.config.web.port) = (page.ip(), page.port());
+    }
+    let archive = &mut site.config.archive;
+    if archive.folder.is_none() {
+        (archive.folder, archive.mib_max) = (Some(options.out.join(ARCHIVE)), ARCHIVE_MIB_MAX);
+    }
     let listen = site.config.modbus.listen;
     let camera = site.camera.clone();
     let failed = |e: std::io::Error| {
@@ -94,6 +106,9 @@ pub fn run(options: Options<'_>) -> Result<String> {
     ));
     let mut source = Synthetic::new(scenario.clone())?;
     let appliance = Appliance::new(site)?;
+    if let Some(page) = appliance.page_address() {
+        log::say(format_args!("the page: {}\n", page_url(page)));
+    }
     let mut paced = Paced::new(&mut source, Pace::RealTime);
     let mut recorder = None;
     let feed: &mut dyn Feed = match options.record {
@@ -136,6 +151,16 @@ pub fn run(options: Options<'_>) -> Result<String> {
     let table = table(source.scenario(), &records, &progress);
     std::fs::write(options.out.join("table.txt"), &table).map_err(failed)?;
     Ok(table)
+}
+
+/// What to type into a browser on this machine.
+fn page_url(page: SocketAddr) -> String {
+    let [v4, v6] = ["127.0.0.1", "[::1]"];
+    match page {
+        SocketAddr::V4(at) if at.ip().is_unspecified() => format!("http://{v4}:{}/", at.port()),
+        SocketAddr::V6(at) if at.ip().is_unspecified() => format!("http://{v6}:{}/", at.port()),
+        at => format!("http://{at}/"),
+    }
 }
 
 fn console(progress: &Progress, elapsed: Duration, last: Option<&ParcelRecord>) {

@@ -3,11 +3,13 @@
 
 mod annotate;
 mod appliance;
+pub mod archive;
 pub mod board;
 pub mod budget;
 pub mod calibrate;
 pub mod demo;
 mod demo_kit;
+mod desk;
 mod explain;
 pub mod import;
 pub mod live;

@@ -1,0 +1,107 @@
+//! Entries as other programs read them.
+
+use super::Stored;
+use serde_json::Value;
+use std::time::{Duration, SystemTime};
+
+/// The columns of a parcel's line, named as in its record.
+pub struct Columns;
+
+impl Columns {
+    const NAMES: [&str; 21] = [
+        "seq",
+        "length_mm",
+        "width_mm",
+        "height_mm",
+        "sigma_length_mm",
+        "sigma_width_mm",
+        "sigma_height_mm",
+        "yaw_deg",
+        "x_mm",
+        "y_mm",
+        "shape",
+        "may_be_used",
+        "flags",
+        "not_measured",
+        "belt_speed_mm_per_s",
+        "belt_travel_mm",
+        "by_encoder",
+        "frame",
+        "t_s",
+        "boots",
+        "version",
+    ];
+
+    /// The line above them.
+    pub fn header() -> String {
+        format!("entry,utc,{}", Self::NAMES.join(","))
+    }
+}
+
+/// A time as RFC 3339 has it, in UTC.
+pub fn utc(utc_ms: u64) -> String {
+    // Up to the year 9999, as the format goes.
+    let since_1970 = Duration::from_millis(utc_ms.min(253_402_300_799_999));
+    humantime::format_rfc3339_millis(SystemTime::UNIX_EPOCH + since_1970).to_string()
+}
+
+/// A parcel as a line of CSV; what its record lacks is empty.
+pub fn csv_line(stored: &Stored) -> String {
+    let record: Value = serde_json::from_str(&stored.entry.text).unwrap_or_default();
+    let mut line = format!("{},{}", stored.number, utc(stored.entry.utc_ms));
+    for name in Columns::NAMES {
+        line.push(',');
+        line.push_str(&cell(&record[name]));
+    }
+    line
+}
+
+/// Numbers and words as they are, lists with bars between. Whatever would end a cell is quoted; whatever
+/// a spreadsheet would take for a formula is not one.
+fn cell(value: &Value) -> String {
+    let text = match value {
+        Value::Null => return String::new(),
+        Value::Number(number) => return number.to_string(),
+        Value::Array(items) => {
+            items.iter().map(|i| i.as_str().unwrap_or_default()).collect::<Vec<_>>().join("|")
+        }
+        Value::String(text) => text.clone(),
+        other => other.to_string(),
+    };
+    let text =
+        if text.starts_with(['=', '+', '-', '@', '\t', '\r']) { format!("'{text}") } else { text };
+    if text.contains(['"', ',', '\n', '\r']) {
+        format!("\"{}\"", text.replace('"', "\"\""))
+    } else {
+        text
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::archive::{Entry, Kind};
+
+    #[test]
+    fn a_line_has_a_cell_for_every_column_whatever_the_record_says() {
+        let line = |text: &str| {
+            let entry = Entry {
+                kind: Kind::Parcel,
+                utc_ms: 1_795_000_000_123,
+                text: text.into(),
+                picture: vec![],
+            };
+            csv_line(&Stored { number: 3, entry })
+        };
+        let whole =
+            line(r#"{"seq":7,"length_mm":235.1,"flags":["merged","clipped"],"shape":"box"}"#);
+        assert!(whole.starts_with("3,2026-11-18T"), "{whole}");
+        assert!(whole.contains(",7,235.1,,") && whole.contains(",merged|clipped,"), "{whole}");
+        let columns = Columns::header().split(',').count();
+        for text in ["", "null", "[1]", r#"{"seq":{"a":1}}"#] {
+            assert_eq!(line(text).split(',').count(), columns, "{text}");
+        }
+        let hostile = line(r#"{"shape":"=cmd(\"x\"),1"}"#);
+        assert!(hostile.contains(r#""'=cmd(""x""),1""#), "{hostile}");
+    }
+}

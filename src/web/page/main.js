@@ -1,0 +1,74 @@
+// The frame around the pages: navigation, lamps, language, theme.
+
+import { askJson, chooseLanguage, count, every, h, number, otherLanguage, remember, remembered, t, time, whenSilent } from "./common.js";
+import { events } from "./events.js";
+import { overview } from "./overview.js";
+import { parcels } from "./parcels.js";
+import { plc } from "./plc.js";
+
+const PAGES = { overview, parcels, plc, events };
+const THEMES = ["auto", "light", "dark"];
+const element = (id) => document.getElementById(id);
+let leave = new AbortController();
+let theme = THEMES.includes(remembered("theme")) ? remembered("theme") : "auto";
+
+function showTheme() {
+  if (theme === "auto") delete document.documentElement.dataset.theme;
+  else document.documentElement.dataset.theme = theme;
+  element("theme").textContent = t(`theme.${theme}`);
+  element("theme").title = t("theme.hint");
+}
+
+function showLamps(state) {
+  element("lamps").replaceChildren(...state.lamps.map((lamp) =>
+    h("li", { class: `${lamp.name} ${lamp.on ? "on" : ""}`, title: lamp.reasons.map((code) => t(`reason.${code}`)).join("\n") },
+      h("span", { class: "dot", "aria-hidden": "true" }),
+      `${t(`lamp.${lamp.name}`)}`,
+      h("span", { class: "soft" }, lamp.on ? t("lamp.on") : t("lamp.off")))));
+  element("footer").textContent = t("footer", {
+    version: state.version, clock: time(state.utc_ms), hours: number(state.uptime_s / 3600, 1), boots: count(state.boots),
+  });
+}
+
+function show() {
+  const name = location.hash.slice(1).split("/")[0];
+  const page = name in PAGES ? name : "overview";
+  leave.abort();
+  leave = new AbortController();
+  element("dialog").close();
+  element("nav").replaceChildren(...Object.keys(PAGES).map((key) =>
+    h("a", { href: `#${key}`, "aria-current": key === page ? "page" : null }, t(`page.${key}`))));
+  document.title = `Beltgauge – ${t(`page.${page}`)}`;
+  element("language").textContent = t("language.other");
+  element("language").lang = otherLanguage();
+  showTheme();
+  const main = element("main");
+  main.replaceChildren(h("h1", {}, t(`page.${page}`)));
+  PAGES[page](main, leave.signal);
+}
+
+element("theme").addEventListener("click", () => {
+  theme = THEMES[(THEMES.indexOf(theme) + 1) % THEMES.length];
+  remember("theme", theme);
+  showTheme();
+});
+element("language").addEventListener("click", async () => {
+  await chooseLanguage(otherLanguage());
+  show();
+});
+window.addEventListener("hashchange", () => {
+  show();
+  element("main").focus();
+});
+whenSilent((since) => {
+  element("offline").hidden = since === null;
+  if (since !== null) element("offline").textContent = t("offline", { since: time(since) });
+});
+
+await chooseLanguage();
+show();
+every(1000, new AbortController().signal, async () => {
+  const state = await askJson("/api/state");
+  showLamps(state);
+  document.dispatchEvent(new CustomEvent("state", { detail: state }));
+});
