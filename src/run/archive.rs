@@ -62,6 +62,9 @@ pub fn export(folder: &Path, to: Export<'_>) -> Result<String> {
             .remedy("give at least one"));
     }
     let reader = Reader::open(folder)?;
+    for (option, path) in [("--csv", to.csv), ("--jsonl", to.jsonl), ("--pictures", to.pictures)] {
+        path.map_or(Ok(()), |path| refuse_inside(option, path, folder))?;
+    }
     let mut csv = to.csv.map(Lines::create).transpose()?;
     let mut jsonl = to.jsonl.map(Lines::create).transpose()?;
     if let Some(csv) = &mut csv {
@@ -135,6 +138,23 @@ pub fn verify(folder: &Path) -> Result<String> {
             write!(text, "\n{} bytes were being written when the power went", verdict.torn_bytes);
     }
     Ok(text)
+}
+
+/// An export must not lie in the archive, nor over a part of it.
+fn refuse_inside(option: &str, path: &Path, folder: &Path) -> Result<()> {
+    let parent = path.parent().filter(|parent| !parent.as_os_str().is_empty());
+    let places = [path, parent.unwrap_or(Path::new("."))];
+    let archive = folder.canonicalize().ok();
+    let is_inside = |place: &Path| {
+        let place = place.canonicalize().ok();
+        place.zip(archive.as_ref()).is_some_and(|(place, archive)| place.starts_with(archive))
+    };
+    if places.into_iter().any(is_inside) {
+        return Err(Error::configuration(format!("{option} {} is in the archive", path.display()))
+            .allowed("a place outside of it")
+            .remedy("choose another one"));
+    }
+    Ok(())
 }
 
 fn unwritable(e: &std::io::Error, path: &Path) -> Error {

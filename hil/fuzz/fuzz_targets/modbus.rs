@@ -5,6 +5,7 @@
 use beltgauge::config::{Modbus, Plc, WordOrder};
 use beltgauge::plc::journal::Journal;
 use beltgauge::plc::link::Link;
+use beltgauge::plc::clients::ClientList;
 use beltgauge::plc::modbus;
 use beltgauge::plc::registers::{CanStatus, VisionStatus};
 use libfuzzer_sys::fuzz_target;
@@ -25,7 +26,7 @@ static SERVER: LazyLock<SocketAddr> = LazyLock::new(|| {
         let plc = Plc { queue: true, ..Plc::default() };
         let now = Instant::now();
         let link = Link::new(plc, WordOrder::HighFirst, false, Journal::default(), now);
-        let served = modbus::serve(listener, &settings, link, |link| {
+        let served = modbus::serve(listener, &settings, ClientList::new(settings.connections_max), link, |link| {
             let (vision, can) = (VisionStatus::default(), CanStatus::default());
             link.update(&vision, &can, None, Instant::now());
             while link.next_request().is_some() {}

@@ -246,6 +246,8 @@ impl<'a> Desk<'a> {
             cuboid_px: self.geometry.recorded(&waiting.framing, &record).filter(|_| is_upright),
         });
         let jpeg = waiting.map(|waiting| waiting.jpeg).unwrap_or_default();
+        // What the PLC's rounding left behind the last digit is noise.
+        let record = record.rounded();
         let parcel = web::Parcel { n: 0, utc_ms: utc_ms(), record, picture };
         let parcel = self.board.parcel(parcel, jpeg.clone());
         self.archive(archive::Kind::Parcel, parcel.utc_ms, &*parcel, jpeg);
