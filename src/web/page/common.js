@@ -7,8 +7,11 @@ let language = "en";
 export async function chooseLanguage(wanted) {
   const preferred = wanted ?? remembered("language") ?? navigator.language.slice(0, 2);
   language = LANGUAGES.includes(preferred) ? preferred : "en";
-  const answer = await fetch(`/${language}.json`);
-  texts = await answer.json();
+  const chosen = language;
+  const found = await (await fetch(`/${chosen}.json`)).json();
+  // Another one was chosen meanwhile.
+  if (chosen !== language) return;
+  texts = found;
   document.documentElement.lang = language;
   if (wanted) remember("language", wanted);
 }

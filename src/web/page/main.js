@@ -10,6 +10,7 @@ const PAGES = { overview, parcels, plc, events };
 const THEMES = ["auto", "light", "dark"];
 const element = (id) => document.getElementById(id);
 let leave = new AbortController();
+let newest = null;
 let theme = THEMES.includes(remembered("theme")) ? remembered("theme") : "auto";
 
 function showTheme() {
@@ -45,6 +46,14 @@ function show() {
   const main = element("main");
   main.replaceChildren(h("h1", {}, t(`page.${page}`)));
   PAGES[page](main, leave.signal);
+  // What is known is shown at once, in the language that was chosen.
+  if (newest) tell(newest);
+}
+
+function tell(state) {
+  newest = state;
+  showLamps(state);
+  document.dispatchEvent(new CustomEvent("state", { detail: state }));
 }
 
 element("theme").addEventListener("click", () => {
@@ -67,8 +76,4 @@ whenSilent((since) => {
 
 await chooseLanguage();
 show();
-every(1000, new AbortController().signal, async () => {
-  const state = await askJson("/api/state");
-  showLamps(state);
-  document.dispatchEvent(new CustomEvent("state", { detail: state }));
-});
+every(1000, new AbortController().signal, async () => tell(await askJson("/api/state")));
