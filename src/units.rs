@@ -33,7 +33,9 @@ pub struct BeltMm {
 }
 
 /// An axis-aligned rectangle on the belt plane, in mm.
-#[derive(Clone, Copy, Debug, PartialEq, serde::Deserialize)]
+#[derive(
+    Clone, Copy, Debug, PartialEq, serde::Deserialize, serde::Serialize, schemars::JsonSchema,
+)]
 #[serde(deny_unknown_fields)]
 pub struct BeltRect {
     /// Upstream end.

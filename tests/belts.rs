@@ -12,21 +12,10 @@ use beltgauge::stage::odometry::Knowledge;
 use common::measure_scenario;
 use std::fmt::Write as _;
 
-/// A 640 x 400 camera 1 m above the belt, 2 mm a pixel, straight down.
-const CAMERA: &str = r#"
-[camera]
-image_size_px = [640, 400]
-[camera.lens]
-model = "brown"
-fx_px = 512.0
-fy_px = 512.0
-cx_px = 319.5
-cy_px = 199.5
-distortion = [0.0, 0.0, 0.0, 0.0, 0.0]
-[camera.pose]
-rotation = [[1.0, 0.0, 0.0], [0.0, -1.0, 0.0], [0.0, 0.0, -1.0]]
-translation_mm = [0.0, 0.0, 1000.0]
-"#;
+/// 640 x 400, 1 m above the belt, 2 mm a pixel.
+fn camera() -> String {
+    common::camera_above([640, 400], 512.0, 1000.0, [0.0; 5])
+}
 
 const SIZE_MM: [f64; 3] = [200.0, 120.0, 80.0];
 const SPEED_MM_PER_S: f64 = 500.0;
@@ -40,9 +29,10 @@ fn boxes(count: usize, grey: f64, texture_grey: f64, tables: &str) -> Scenario {
 fn belt(parcels: &[([f64; 3], f64)], grey: f64, texture_grey: f64, tables: &str) -> Scenario {
     let frames = 105 + 30 * parcels.len();
     let mut text = format!(
-        "seed = 3\nfps = 30\nframes = {frames}\nexposure_ms = 1\n{CAMERA}\
+        "seed = 3\nfps = 30\nframes = {frames}\nexposure_ms = 1\n{}\
          [belt]\nspeed_mm_per_s = {SPEED_MM_PER_S}\nwidth_mm = 800\ngrey = {grey}\n\
-         texture_grey = {texture_grey}\n{tables}\n"
+         texture_grey = {texture_grey}\n{tables}\n",
+        camera()
     );
     for (k, ([l, w, h], yaw_deg)) in parcels.iter().enumerate() {
         let x_mm = -1000.0 - 500.0 * k as f64;

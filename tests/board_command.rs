@@ -86,6 +86,9 @@ fn the_board_that_is_drawn_is_found_in_true_size_in_both_formats() {
             assert!(rectangles.iter().all(inside), "a printer cuts {file} of {squares} off");
             let lines = rectangles.iter().filter(|r| near(r[2].max(r[3]), 100.0)).count();
             assert_eq!(lines, 2, "{file}: lines of 100 mm");
+            // A screen has 96 pixels an inch: what is thinner may fall between two rows of them.
+            let thinnest_mm = rectangles.iter().map(|r| r[2].min(r[3])).fold(f64::MAX, f64::min);
+            assert!(thinnest_mm > 25.4 / 96.0, "{file}: a line of {thinnest_mm} mm is not drawn");
             let (grey, [width, height]) = picture(size_mm, &rectangles);
             let board = Chessboard::new(corners, square_mm);
             let plane = Plane::packed(&grey, width, height).expect("this size");

@@ -16,11 +16,9 @@ const FPS: f64 = 30.0;
 /// Twelve equal parcels in a row, a camera 1.5 m above them.
 fn scenario() -> Scenario {
     let mut text = format!(
-        "seed = 5\nfps = {FPS}\nframes = 420\nexposure_ms = 1.5\n[camera]\nimage_size_px = [1280, 800]\n\
-         [camera.lens]\nmodel = \"brown\"\nfx_px = 900\nfy_px = 900\ncx_px = 640\ncy_px = 400\n\
-         distortion = [-0.1, 0.02, 0, 0, 0]\n[camera.pose]\n\
-         rotation = [[1, 0, 0], [0, -1, 0], [0, 0, -1]]\ntranslation_mm = [0, 0, 1500]\n\
-         [belt]\nspeed_mm_per_s = {SPEED_MM_PER_S}\nwidth_mm = 900\ngrey = 45\ntexture_grey = 1.3\n"
+        "seed = 5\nfps = {FPS}\nframes = 420\nexposure_ms = 1.5\n{}\
+         [belt]\nspeed_mm_per_s = {SPEED_MM_PER_S}\nwidth_mm = 900\ngrey = 45\ntexture_grey = 1.3\n",
+        common::camera_above([1280, 800], 900.0, 1500.0, [-0.1, 0.02, 0.0, 0.0, 0.0])
     );
     let [l, w, h] = SIZE_MM;
     for i in 0..12 {

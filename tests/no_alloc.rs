@@ -1,6 +1,8 @@
 //! After start-up the capture and vision threads allocate nothing.
 #![allow(unsafe_code)] // a counting allocator cannot be written without
 
+mod common;
+
 use beltgauge::archive::Reader;
 use beltgauge::config::{Config, Site};
 use beltgauge::error::Result;
@@ -173,18 +175,10 @@ fn long_belt(width: usize, frames: u64) -> (Synthetic, Site) {
     let scale = width as f64 / 1920.0;
     let text = format!(
         "seed = 3\nfps = 42\nframes = {frames}\nexposure_ms = 1.0\n\
-         [camera]\nimage_size_px = [{width}, {}]\n[camera.lens]\nmodel = \"brown\"\n\
-         fx_px = {}\nfy_px = {}\ncx_px = {}\ncy_px = {}\ndistortion = [0, 0, 0, 0, 0]\n\
-         [camera.pose]\nrotation = [[1, 0, 0], [0, -1, 0], [0, 0, -1]]\n\
-         translation_mm = [0, 0, 1500]\n\
-         [belt]\nspeed_mm_per_s = 1000\nwidth_mm = 1300\ngrey = 45\ntexture_grey = 1.5\n\
+         {}[belt]\nspeed_mm_per_s = 1000\nwidth_mm = 1300\ngrey = 45\ntexture_grey = 1.5\n\
          [random]\ncount = 400\nfirst_x_mm = -1800\ngap_mm = [250, 350]\ny_mm = [-200, 200]\n\
          length_mm = [150, 300]\nwidth_mm = [100, 200]\nheight_mm = [40, 150]\n",
-        (1200.0 * scale) as usize,
-        1020.0 * scale,
-        1020.0 * scale,
-        959.5 * scale,
-        599.5 * scale
+        common::camera_above([width, (1200.0 * scale) as usize], 1020.0 * scale, 1500.0, [0.0; 5])
     );
     let scenario = Scenario::parse(&text).expect("valid");
     let config = "[camera]\ncalibration = \"the scenario's\"\n[belt]\nspeed_mm_per_s = 990\n\

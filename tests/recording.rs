@@ -39,7 +39,7 @@ fn measure(folder: &Path, arguments: &[&str]) -> Vec<serde_json::Value> {
 /// The demo's belt in a quarter of its pixels.
 fn small() -> Scenario {
     let text = include_str!("../config/demo/scenario.toml")
-        .replace("frames = 100000", "frames = 170")
+        .replace("exposure_ms", "frames = 170\nexposure_ms")
         .replace("[1280, 800]", "[640, 400]")
         .replace("fx_px = 679.5", "fx_px = 339.7")
         .replace("fy_px = 679.9", "fy_px = 339.9")
@@ -61,7 +61,7 @@ fn a_recording_of_a_camera_that_lost_frames_gives_the_same_records_again() {
     let mut source = FaultInjector::new(Box::new(belt), faults);
     let mut feed = Paced::new(&mut source, Pace::Unhurried);
     let path = folder.join("recording.y4m");
-    let mut recorder = Recorder::create(&mut feed, &path).expect("room");
+    let mut recorder = Recorder::create(&mut feed, &path, 8).expect("room");
     let mut buffer = Block::own(640 * 400).expect("small");
     let site = Site::load(&config).expect("valid");
     let (_, mut pipeline) = beltgauge::run::build(site).expect("fits");

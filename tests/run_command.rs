@@ -54,6 +54,11 @@ fn wait_for(path: &Path, words: &[&str]) -> String {
 fn terminate(run: &mut Run) -> Option<i32> {
     let pid = rustix::process::Pid::from_child(&run.0);
     rustix::process::kill_process(pid, rustix::process::Signal::TERM).expect("runs");
+    status(run)
+}
+
+/// The exit status, soon.
+fn status(run: &mut Run) -> Option<i32> {
     let start = Instant::now();
     loop {
         if let Some(status) = run.0.try_wait().expect("a child") {
@@ -107,6 +112,30 @@ fn without_a_configuration_it_ends_with_the_remedy() {
     let text = String::from_utf8_lossy(&output.stderr);
     assert_eq!(output.status.code(), Some(2), "{text}");
     assert!(text.contains("current/beltgauge.toml") && text.contains("remedy"), "{text}");
+}
+
+/// Features of this build; the tests are built with the same.
+const MISSING: &[&str] = &[
+    #[cfg(not(feature = "v4l2"))]
+    "v4l2",
+    #[cfg(not(feature = "aravis"))]
+    "aravis",
+];
+
+#[test]
+fn an_interface_that_is_not_built_in_ends_it_and_names_the_feature() {
+    for feature in MISSING {
+        let folder = scratch(&format!("run-without-{feature}"));
+        let mut run = start(&folder, &format!("interface = \"{feature}\""), &[]);
+        let log = wait_for(&folder.join("log"), &["camera.interface", "remedy"]);
+        assert!(log.contains(&format!("--features {feature}")), "{log}");
+        assert_eq!(status(&mut run), Some(2), "{log}");
+        // On another machine the same configuration may be right.
+        let config = folder.join("beltgauge.toml");
+        let output = common::run(beltgauge().arg("check").arg("--config").arg(config));
+        let text = String::from_utf8_lossy(&output.stderr);
+        assert!(output.status.success() && text.contains("warning: camera.interface"), "{text}");
+    }
 }
 
 /// What a thread of a process may do: lines of its status, by their names.
@@ -202,4 +231,47 @@ fn a_log_that_nobody_reads_holds_nobody_up() {
         assert_eq!(answer[9..], [0x42, 0x47]);
     }
     assert_eq!(terminate(&mut run), Some(0));
+}
+
+#[test]
+fn systemd_is_told_that_it_runs_that_it_lives_and_that_it_ends() {
+    let folder = scratch("run-systemd");
+    let config = write_site(&folder, SIZE);
+    let text = fs::read_to_string(&config).expect("there");
+    let text = text.replace("[zone]", "device = \"/dev/video99\"\n[zone]");
+    fs::write(&config, text + "[modbus]\nlisten = \"127.0.0.1:0\"\n").expect("room");
+    let systemd = std::os::unix::net::UnixDatagram::bind(folder.join("notify")).expect("a socket");
+    systemd.set_read_timeout(Some(Duration::from_secs(30))).expect("a time");
+    let told = || {
+        let mut bytes = [0; 200];
+        let count = systemd.recv(&mut bytes).expect("told in time");
+        String::from_utf8_lossy(&bytes[..count]).into_owned()
+    };
+    let child = beltgauge()
+        .arg("run")
+        .arg(&config)
+        .env("NOTIFY_SOCKET", folder.join("notify"))
+        .stderr(Stdio::null())
+        .spawn();
+    let mut run = Run(child.expect("starts"));
+    for _ in 0..2 {
+        assert_eq!(told(), "READY=1\nWATCHDOG=1\n");
+    }
+    assert_eq!(terminate(&mut run), Some(0));
+    let last = std::iter::repeat_with(told).find(|text| !text.contains("WATCHDOG"));
+    assert_eq!(last.as_deref(), Some("STOPPING=1\n"));
+}
+
+#[test]
+fn an_error_reaches_whoever_is_slow_to_read_it() {
+    let (mut reader, writer) = full_pipe();
+    let child = beltgauge().args(["check", "no-such-file.toml"]).stderr(writer).spawn();
+    let mut check = Run(child.expect("starts"));
+    // Longer than the log waits at its end for its reader.
+    std::thread::sleep(Duration::from_secs(3));
+    let mut text = Vec::new();
+    std::io::Read::read_to_end(&mut reader, &mut text).expect("a pipe");
+    let text = String::from_utf8_lossy(&text);
+    assert!(text.contains("error: ") && text.contains("no-such-file.toml"), "lost");
+    assert_eq!(status(&mut check), Some(2));
 }

@@ -33,6 +33,9 @@ pub struct ImageEntry {
     /// Why it is not part of the result.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub rejected: Option<String>,
+    /// It was turned by 180 degrees against the others, and was turned back.
+    #[serde(skip_serializing_if = "std::ops::Not::not")]
+    pub turned_back: bool,
 }
 
 /// The belt under the camera, and how far it can be trusted: standard deviations.

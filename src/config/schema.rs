@@ -1,15 +1,17 @@
 //! The keys of the configuration file, their defaults and ranges.
 
 use super::plc::{Can, Encoder, Modbus, Plc};
+use super::ranges::{self, range};
 use super::service::{Archive, Web};
 use crate::error::{Error, Result};
 use crate::units::BeltRect;
 use minisign_verify::PublicKey;
-use serde::Deserialize;
+use schemars::JsonSchema;
+use serde::{Deserialize, Serialize};
 use std::path::PathBuf;
 
 /// The configuration file.
-#[derive(Clone, Debug, PartialEq, Deserialize)]
+#[derive(Clone, Debug, PartialEq, Deserialize, Serialize, JsonSchema)]
 #[serde(deny_unknown_fields)]
 pub struct Config {
     /// `[camera]`
@@ -63,7 +65,7 @@ pub struct Config {
 }
 
 /// How a live camera is reached.
-#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Deserialize)]
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Deserialize, Serialize, JsonSchema)]
 #[serde(rename_all = "lowercase")]
 pub enum Interface {
     /// Video4Linux: USB webcams and industrial cameras with a kernel driver.
@@ -76,7 +78,7 @@ pub enum Interface {
 }
 
 /// `[camera]`: where the pictures come from and how they were taken.
-#[derive(Clone, Debug, PartialEq, Deserialize)]
+#[derive(Clone, Debug, PartialEq, Deserialize, Serialize, JsonSchema)]
 #[serde(deny_unknown_fields)]
 pub struct CameraTable {
     /// Calibration file, relative to the configuration file.
@@ -102,6 +104,7 @@ pub struct CameraTable {
     pub frame_timeout_s: f64,
     /// Other controls by the driver's or GenICam's name, set in this order, trigger for one.
     #[serde(default)]
+    #[schemars(with = "std::collections::BTreeMap<String, serde_json::Value>")]
     pub controls: toml::Table,
 }
 
@@ -128,15 +131,6 @@ impl CameraTable {
     }
 
     fn check(&self) -> Result<()> {
-        for (key, value, min, max, unit) in [
-            ("camera.fps", self.fps, 0.5, 1000.0, "frames a second"),
-            ("camera.exposure_us", self.exposure_us, 1.0, 1e6, "us"),
-            ("camera.gain", self.gain, 0.0, 1e6, ""),
-            ("camera.packet_bytes", self.packet_bytes.map(f64::from), 576.0, 9000.0, "bytes"),
-        ] {
-            value.map_or(Ok(()), |value| range(key, value, min, max, unit))?;
-        }
-        range("camera.frame_timeout_s", self.frame_timeout_s, 0.0, 3600.0, "s")?;
         for (name, value) in &self.controls {
             if value.is_table() || value.is_array() || value.is_datetime() {
                 return Err(Error::configuration(format!("camera.controls.{name} = {value}"))
@@ -149,7 +143,7 @@ impl CameraTable {
 }
 
 /// `[belt]`
-#[derive(Clone, Debug, PartialEq, Deserialize)]
+#[derive(Clone, Debug, PartialEq, Deserialize, Serialize, JsonSchema)]
 #[serde(deny_unknown_fields)]
 pub struct Belt {
     /// Nominal speed; may be off by 5 %.
@@ -157,7 +151,7 @@ pub struct Belt {
 }
 
 /// `[view]`: the rectified belt view.
-#[derive(Clone, Debug, Default, PartialEq, Deserialize)]
+#[derive(Clone, Debug, Default, PartialEq, Deserialize, Serialize, JsonSchema)]
 #[serde(deny_unknown_fields)]
 pub struct View {
     /// Pixel size on the belt; default: the camera's own in the middle of the zone.
@@ -167,7 +161,7 @@ pub struct View {
 }
 
 /// `[background]`: the Gaussian mixture model.
-#[derive(Clone, Debug, PartialEq, Deserialize)]
+#[derive(Clone, Debug, PartialEq, Deserialize, Serialize, JsonSchema)]
 #[serde(deny_unknown_fields, default)]
 pub struct Background {
     /// Frames at start-up on which the empty belt is learned and no parcel is reported.
@@ -196,7 +190,7 @@ impl Default for Background {
 }
 
 /// `[segment]`: from mask to blobs.
-#[derive(Clone, Debug, PartialEq, Deserialize)]
+#[derive(Clone, Debug, PartialEq, Deserialize, Serialize, JsonSchema)]
 #[serde(deny_unknown_fields, default)]
 pub struct Segment {
     /// Specks narrower than this vanish (opening).
@@ -217,7 +211,7 @@ impl Default for Segment {
 }
 
 /// `[odometry]`: belt motion from the belt's own texture.
-#[derive(Clone, Debug, PartialEq, Deserialize)]
+#[derive(Clone, Debug, PartialEq, Deserialize, Serialize, JsonSchema)]
 #[serde(deny_unknown_fields, default)]
 pub struct Odometry {
     /// Largest relative error of the nominal speed that is searched.
@@ -231,7 +225,7 @@ impl Default for Odometry {
 }
 
 /// `[measure]`: from edges to a cuboid.
-#[derive(Clone, Debug, PartialEq, Deserialize)]
+#[derive(Clone, Debug, PartialEq, Deserialize, Serialize, JsonSchema)]
 #[serde(deny_unknown_fields, default)]
 pub struct Measure {
     /// Radius of a parcel's edges: rounded edges appear inside of the outer size.
@@ -247,7 +241,7 @@ impl Default for Measure {
 }
 
 /// `[limits]`: the size of every table.
-#[derive(Clone, Debug, PartialEq, Deserialize)]
+#[derive(Clone, Debug, PartialEq, Deserialize, Serialize, JsonSchema)]
 #[serde(deny_unknown_fields, default)]
 pub struct Limits {
     /// The memory plan may not need more.
@@ -278,7 +272,7 @@ impl Default for Limits {
 }
 
 /// `[realtime]`: how the vision thread gets its processor.
-#[derive(Clone, Debug, PartialEq, Deserialize)]
+#[derive(Clone, Debug, PartialEq, Deserialize, Serialize, JsonSchema)]
 #[serde(deny_unknown_fields, default)]
 pub struct Realtime {
     /// Threads that a frame's rows are shared among.
@@ -298,7 +292,7 @@ impl Default for Realtime {
 }
 
 /// `[import]`: what a USB stick may change.
-#[derive(Clone, Debug, Default, PartialEq, Eq, Deserialize)]
+#[derive(Clone, Debug, Default, PartialEq, Eq, Deserialize, Serialize, JsonSchema)]
 #[serde(deny_unknown_fields)]
 pub struct Import {
     /// Only sets signed with the secret key that belongs to this one (minisign) are accepted.
@@ -317,100 +311,32 @@ pub fn public_key(text: &str) -> Result<PublicKey> {
 impl Config {
     /// Parse and check each key on its own.
     pub fn parse(text: &str) -> Result<Self> {
-        let config: Self = toml::from_str(text).map_err(|e| {
+        let not_understood = |e: toml::de::Error| {
             Error::configuration(e.to_string().trim_end().to_owned())
                 .allowed("the keys of config/reference.toml; lengths in mm, speeds in mm per s")
                 .remedy("correct the line shown")
-        })?;
+        };
+        let config: Self = toml::from_str(text).map_err(not_understood)?;
+        ranges::check(&toml::from_str(text).map_err(not_understood)?)?;
         config.check()?;
         Ok(config)
     }
 
+    /// What the table of ranges cannot say.
     fn check(&self) -> Result<()> {
-        let Self {
-            camera,
-            zone,
-            belt,
-            view,
-            background,
-            segment,
-            odometry,
-            measure,
-            limits,
-            realtime,
-            plc,
-            modbus,
-            can,
-            encoder,
-            import,
-            web,
-            archive,
-        } = self;
+        let Self { camera, zone, plc, modbus, can, encoder, import, web, .. } = self;
         camera.check()?;
         for (key, mm) in [
-            ("zone.x_min_mm", zone.x_min_mm),
-            ("zone.x_max_mm", zone.x_max_mm),
-            ("zone.y_min_mm", zone.y_min_mm),
-            ("zone.y_max_mm", zone.y_max_mm),
+            ("zone.x_max_mm - zone.x_min_mm", zone.x_max_mm - zone.x_min_mm),
+            ("zone.y_max_mm - zone.y_min_mm", zone.y_max_mm - zone.y_min_mm),
         ] {
-            range(key, mm, -20_000.0, 20_000.0, "mm")?;
-        }
-        range(
-            "zone.x_max_mm - zone.x_min_mm",
-            zone.x_max_mm - zone.x_min_mm,
-            50.0,
-            10_000.0,
-            "mm",
-        )?;
-        range(
-            "zone.y_max_mm - zone.y_min_mm",
-            zone.y_max_mm - zone.y_min_mm,
-            50.0,
-            10_000.0,
-            "mm",
-        )?;
-        range("belt.speed_mm_per_s", belt.speed_mm_per_s, 10.0, 10_000.0, "mm per s")?;
-        if let Some(mm) = view.mm_per_px {
-            range("view.mm_per_px", mm, 0.05, 20.0, "mm")?;
-        }
-        if let Some(mm) = view.height_max_mm {
-            range("view.height_max_mm", mm, 5.0, 5_000.0, "mm")?;
-        }
-        count("background.learn_frames", background.learn_frames as usize, 1, 1000)?;
-        count("background.history_frames", background.history_frames as usize, 20, 2000)?;
-        range("background.threshold_sigma", background.threshold_sigma, 3.0, 10.0, "")?;
-        range("background.shadow_ratio_min", background.shadow_ratio_min, 0.1, 1.0, "")?;
-        let deep = background.deep_shadow_ratio_min;
-        range("background.deep_shadow_ratio_min", deep, 0.0, 1.0, "")?;
-        count("segment.open_px", segment.open_px, 0, 10)?;
-        count("segment.close_px", segment.close_px, 0, 30)?;
-        range("segment.area_min_mm2", segment.area_min_mm2, 1.0, 1e6, "mm2")?;
-        if let Some(side_min_mm) = segment.side_min_mm {
-            range("segment.side_min_mm", side_min_mm, 0.0, 1000.0, "mm")?;
-        }
-        range("odometry.speed_error_max", odometry.speed_error_max, 0.0, 0.2, "")?;
-        range("measure.edge_radius_mm", measure.edge_radius_mm, 0.0, 20.0, "mm")?;
-        range("measure.sigma_max_mm", measure.sigma_max_mm, 0.1, 100.0, "mm")?;
-        count("limits.memory_mib_max", limits.memory_mib_max, 1, 16_384)?;
-        count("limits.tracks_max", limits.tracks_max, 1, 256)?;
-        count("limits.runs_max", limits.runs_max, 256, 1 << 20)?;
-        count("limits.blobs_max", limits.blobs_max, 16, 1 << 16)?;
-        count("limits.views_per_track_max", limits.views_per_track_max, 16, 1024)?;
-        count("limits.frames_queued_max", limits.frames_queued_max, 2, 15)?;
-        count("realtime.workers", realtime.workers, 1, 8)?;
-        count("realtime.priority", usize::from(realtime.priority), 0, 99)?;
-        if let Some(processor) = realtime.first_processor {
-            count("realtime.first_processor", processor, 0, 1023)?;
+            range(key, mm, 50.0, 10_000.0, "mm")?;
         }
         plc.check()?;
-        count("modbus.connections_max", modbus.connections_max, 1, 256)?;
-        count("modbus.idle_timeout_s", modbus.idle_timeout_s as usize, 1, 86_400)?;
-        count("modbus.base_address", usize::from(modbus.base_address), 0, 60_000)?;
         can.check()?;
         encoder.check()?;
         check_writers(plc, modbus, can, encoder)?;
         web.check()?;
-        archive.check()?;
         import.public_key.as_deref().map_or(Ok(()), |key| public_key(key).map(drop))
     }
 }
@@ -443,22 +369,4 @@ fn check_writers(plc: &Plc, modbus: &Modbus, can: &Can, encoder: &Encoder) -> Re
     ))
     .allowed("addresses of the PLCs that write, as [\"192.168.1.10\"]")
     .remedy(format!("name the PLC in modbus.write_allow, or can.interface, or {without}")))
-}
-
-pub(super) fn range(key: &str, value: f64, min: f64, max: f64, unit: &str) -> Result<()> {
-    if (min..=max).contains(&value) {
-        return Ok(());
-    }
-    let remedy = if unit.starts_with("mm") && (min..=max).contains(&(1000.0 * value)) {
-        "this looks like metres: write it in mm"
-    } else {
-        "correct the value"
-    };
-    Err(Error::configuration(format!("{key} = {value}"))
-        .allowed(format!("{min} to {max} {unit}").trim_end())
-        .remedy(remedy))
-}
-
-pub(super) fn count(key: &str, value: usize, min: usize, max: usize) -> Result<()> {
-    range(key, value as f64, min as f64, max as f64, "")
 }

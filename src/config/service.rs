@@ -1,13 +1,13 @@
 //! The tables of what people see: the web page, and the archive behind it.
 
-use super::schema::count;
 use crate::error::{Error, Result};
-use serde::Deserialize;
+use schemars::JsonSchema;
+use serde::{Deserialize, Serialize};
 use std::net::{IpAddr, Ipv4Addr};
 use std::path::PathBuf;
 
 /// `[web]`: the page for people, and figures for machines.
-#[derive(Clone, Debug, PartialEq, Eq, Deserialize)]
+#[derive(Clone, Debug, PartialEq, Eq, Deserialize, Serialize, JsonSchema)]
 #[serde(deny_unknown_fields, default)]
 pub struct Web {
     /// Serve it.
@@ -38,7 +38,7 @@ impl Default for Web {
 }
 
 /// `[archive]`: parcels with their pictures, and events, on the disk.
-#[derive(Clone, Debug, PartialEq, Eq, Deserialize)]
+#[derive(Clone, Debug, PartialEq, Eq, Deserialize, Serialize, JsonSchema)]
 #[serde(deny_unknown_fields, default)]
 pub struct Archive {
     /// Its folder, relative to the configuration file; none given: the store's, or none.
@@ -58,8 +58,6 @@ const HOST_CHARACTERS_MAX: usize = 253;
 
 impl Web {
     pub(super) fn check(&self) -> Result<()> {
-        count("web.connections_max", self.connections_max, 8, 1024)?;
-        count("web.pictures_per_s_max", self.pictures_per_s_max as usize, 1, 60)?;
         let is_name = |host: &&String| {
             (1..=HOST_CHARACTERS_MAX).contains(&host.len())
                 && host.bytes().all(|b| b.is_ascii_alphanumeric() || b"-._".contains(&b))
@@ -70,11 +68,5 @@ impl Web {
                 .allowed("names of letters, digits, dots and hyphens, without scheme and port")
                 .remedy("write it as [\"lane3.example.com\"]")),
         }
-    }
-}
-
-impl Archive {
-    pub(super) fn check(&self) -> Result<()> {
-        count("archive.mib_max", self.mib_max, 16, 1 << 20)
     }
 }

@@ -20,7 +20,7 @@ pub mod table;
 
 /// A record for tests.
 #[cfg(test)]
-fn record(seq: u32) -> crate::event::ParcelRecord {
+pub(crate) fn record(seq: u32) -> crate::event::ParcelRecord {
     crate::event::ParcelRecord {
         seq,
         frame: 137,

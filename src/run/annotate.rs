@@ -19,6 +19,9 @@ const SIDE: Rgb888 = Rgb888::new(90, 190, 255);
 /// Raw belts are dark; pictures are for people.
 const BRIGHTEN_PERCENTILE: usize = 99;
 
+/// Captions stay this far inside of the picture.
+const CAPTION_MARGIN_PX: i32 = 4;
+
 /// Keeps, for each parcel in view, the frame where its record will hold, and draws it.
 pub struct Annotator {
     folder: PathBuf,
@@ -107,16 +110,13 @@ pub fn draw(
             record.sigma_width_mm,
             record.height_mm,
             record.sigma_height_mm,
-            record.flags
+            record.flags.to_string().replace(", ", "\n")
         ),
     };
     let seen = || base.iter().chain(&top).flatten();
     let right = seen().map(|p| p.x).max().unwrap_or(0) + 10;
     let above = seen().map(|p| p.y).min().unwrap_or(0);
-    canvas.text(
-        &text,
-        Point::new(right.min(width as i32 - 190).max(4), above.min(height as i32 - 90).max(18)),
-    );
+    canvas.text(&text, Point::new(right, above));
     let path = folder.join(format!("parcel_{:04}.png", record.seq));
     image::save_buffer(&path, &canvas.rgb, width as u32, height as u32, image::ColorType::Rgb8)
         .map_err(|e| {
@@ -160,13 +160,24 @@ impl Canvas {
         }
     }
 
+    /// At a place, or as near to it as all of it is in the picture.
     fn text(&mut self, text: &str, at: Point) {
         let style = MonoTextStyleBuilder::new()
             .font(&FONT_9X18_BOLD)
             .text_color(Rgb888::YELLOW)
             .background_color(Rgb888::BLACK)
             .build();
-        let Ok(_) = Text::new(text, at, style).draw(self);
+        let text = Text::new(text, at, style);
+        let caption = text.bounding_box();
+        let shift = |from: i32, length: u32, side: usize| {
+            let last = side as i32 - length as i32 - CAPTION_MARGIN_PX;
+            from.min(last).max(CAPTION_MARGIN_PX) - from
+        };
+        let by = Point::new(
+            shift(caption.top_left.x, caption.size.width, self.width),
+            shift(caption.top_left.y, caption.size.height, self.height),
+        );
+        let Ok(_) = text.translate(by).draw(self);
     }
 }
 
@@ -192,5 +203,25 @@ impl DrawTarget for Canvas {
             }
         }
         Ok(())
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_caption_is_all_in_the_picture_wherever_its_parcel_is() {
+        let [width, height] = [400, 150];
+        let yellow = |at: Point| {
+            let mut canvas = Canvas::new(&vec![0; width * height], width, height);
+            canvas.text("#12 Irregular\nfootprint_uncertain\nheight_uncertain", at);
+            canvas.rgb.chunks(3).filter(|px| px[0] == 255 && px[1] == 255).count()
+        };
+        let whole = yellow(Point::new(100, 60));
+        assert!(whole > 500, "{whole}");
+        for at in [[395, 60], [100, 149], [-50, 60], [100, -40], [399, 149], [5000, -9000]] {
+            assert_eq!(yellow(Point::new(at[0], at[1])), whole, "{at:?}");
+        }
     }
 }

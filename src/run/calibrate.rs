@@ -119,6 +119,7 @@ pub fn belt(
             file: shot.name.clone(),
             rms_px: Some(still.rms_px),
             rejected: None,
+            turned_back: false,
         })
         .collect();
     let table = belt_table(&calibration);
@@ -302,11 +303,13 @@ fn lens_entries(
         .iter()
         .map(|shot| {
             let file = shot.name.clone();
-            let (rms_px, rejected) = match &shot.board {
-                Err(reason) => (None, Some(no_use(board, &shot.still, *reason))),
-                Ok(_) => views.next().map_or((None, None), |v| (v.rms_px, v.rejected.clone())),
+            let view = if shot.board.is_ok() { views.next() } else { None };
+            let rejected = match &shot.board {
+                Err(reason) => Some(no_use(board, &shot.still, *reason)),
+                Ok(_) => view.and_then(|v| v.rejected.clone()),
             };
-            ImageEntry { file, rms_px, rejected }
+            let (rms_px, turned_back) = view.map_or((None, false), |v| (v.rms_px, v.is_turned));
+            ImageEntry { file, rms_px, rejected, turned_back }
         })
         .collect()
 }
@@ -314,7 +317,8 @@ fn lens_entries(
 fn entry_line(entry: &ImageEntry) -> String {
     let error = entry.rms_px.map_or("      -   ".to_owned(), |rms| format!("{rms:7.3} px"));
     let rejected = entry.rejected.as_ref().map_or(String::new(), |r| format!("  rejected: {r}"));
-    format!("{:24} {error}{rejected}", entry.file)
+    let turned = if entry.turned_back { "  turned by 180 degrees: turned back" } else { "" };
+    format!("{:24} {error}{turned}{rejected}", entry.file)
 }
 
 fn lens_summary(calibration: &LensCalibration) -> String {

@@ -1,33 +1,36 @@
 //! `beltgauge demo`: the appliance in real time on the synthetic belt, and the truth beside it.
 
 use super::annotate::draw;
-use super::{Appliance, Progress, demo_kit, log};
+use super::demo_results::Results;
+use super::{Appliance, Progress, demo_kit, log, memory};
 use crate::config::{Config, Site};
 use crate::error::{Error, Result};
 use crate::event::ParcelRecord;
-use crate::source::synthetic::{Parcel, Scenario, Synthetic};
+use crate::source::synthetic::{Scenario, Synthetic};
 use crate::source::{Feed, FrameSource, Pace, Paced, Recorder};
-use std::fmt::Write as _;
+use signal_hook::consts::{SIGINT, SIGTERM};
 use std::net::SocketAddr;
 use std::path::Path;
+use std::sync::Arc;
+use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::{Duration, Instant};
 
 const SCENARIO: &str = include_str!("../../config/demo/scenario.toml");
 const CONFIG: &str = include_str!("../../config/demo/beltgauge.toml");
 /// The recording in the folder of `--record`.
 const RECORDING: &str = "recording.y4m";
-/// A record belongs to the parcel whose true centre is this near.
-const MATCH_MM: f64 = 60.0;
 /// Folder of the archive in that of the results, and what it may take of the disk.
 const ARCHIVE: &str = "archive";
 const ARCHIVE_MIB_MAX: usize = 256;
+/// The longest time that makes sense.
+const SECONDS_MAX: f64 = 1e6;
 /// The console line is renewed this often.
 const CONSOLE_PERIOD: Duration = Duration::from_millis(200);
 
 /// What to run.
 #[derive(Clone, Copy, Debug)]
 pub struct Options<'a> {
-    /// How long.
+    /// How long; 0: until it is told to end.
     pub seconds: f64,
     /// Folder for table, records and pictures; created.
     pub out: &'a Path,
@@ -71,13 +74,54 @@ fn site_with(scenario: &Scenario, path: &Path) -> Result<Site> {
     Ok(site)
 }
 
+/// Set by SIGTERM or Ctrl-C. A second one ends the program at once.
+fn until_told() -> Result<Arc<AtomicBool>> {
+    let stop = Arc::new(AtomicBool::new(false));
+    for signal in [SIGTERM, SIGINT] {
+        signal_hook::flag::register_conditional_default(signal, Arc::clone(&stop))
+            .and_then(|_| signal_hook::flag::register(signal, Arc::clone(&stop)))
+            .map_err(|e| Error::failure(format!("cannot wait for signals: {e}")))?;
+    }
+    Ok(stop)
+}
+
+/// What will happen, for whoever has just started it.
+fn introduction(scenario: &Scenario, seconds: f64, listen: SocketAddr, out: &Path) -> String {
+    let how_long = if seconds == 0.0 {
+        "until Ctrl-C".to_owned()
+    } else {
+        format!("for {seconds:.0} s; Ctrl-C ends it earlier")
+    };
+    let stop = scenario.belt.stops.first().filter(|stop| seconds == 0.0 || stop.at_s < seconds);
+    let stop = stop.map_or_else(String::new, |stop| {
+        let again = stop.every_s.filter(|s| seconds == 0.0 || stop.at_s + s < seconds);
+        let again = again.map_or_else(String::new, |s| format!(" and then every {s:.0} s"));
+        format!(
+            "The belt stops on purpose, after {:.0} s{again}, for {:.1} s. Sizes must not suffer.\n",
+            stop.at_s, stop.for_s
+        )
+    });
+    format!(
+        "Demo: the whole appliance on a synthetic belt, {how_long}. No camera and no PLC are needed.\n\
+         Parcels come after 2 s. Their true sizes are known, but not to the appliance.\n{stop}\
+         At the end there is a table of true and measured sizes, here and in {}.\n\
+         A PLC, or any Modbus client, can read the parcels on {listen}: see config/REGISTERS.md.\n",
+        out.display()
+    )
+}
+
 /// Run the demo; returns the table of measured against true sizes.
 pub fn run(options: Options<'_>) -> Result<String> {
-    if !(1.0..=3000.0).contains(&options.seconds) {
-        return Err(
-            Error::configuration(format!("--seconds {}", options.seconds)).allowed("1 to 3000")
-        );
+    let endless = options.seconds == 0.0;
+    if !(endless || (1.0..=SECONDS_MAX).contains(&options.seconds)) {
+        return Err(Error::configuration(format!("--seconds {}", options.seconds))
+            .allowed(format!("1 to {SECONDS_MAX:.0}, or 0: until Ctrl-C")));
     }
+    if endless && options.record.is_some() {
+        return Err(Error::configuration("--record without an end: 30 MB a second fill any disk")
+            .remedy("say how long, for example --seconds 60"));
+    }
+    let stop = until_told()?;
     let scenario = scenario()?;
     let mut site = match options.config {
         Some(path) => site_with(&scenario, path)?,
@@ -99,12 +143,13 @@ pub fn run(options: Options<'_>) -> Result<String> {
         Error::failure(format!("cannot write the results: {e}")).in_file(options.out)
     };
     std::fs::create_dir_all(options.out).map_err(failed)?;
-    let records_path = options.out.join("parcels.jsonl");
-    std::fs::write(&records_path, "").map_err(failed)?; // found out now, not at the end
-    log::say(format_args!(
-        "rendering the belt; Modbus TCP on {listen}, registers as in config/REGISTERS.md\n"
-    ));
+    // Created now, not at the end: then a folder that cannot be written to costs no time.
+    let mut results = Results::create(&options.out.join("parcels.jsonl"))?;
     let mut source = Synthetic::new(scenario.clone())?;
+    let recorder_mib = match options.record {
+        None => 0,
+        Some(_) => memory::room_for_recorder(&site)?,
+    };
     let appliance = Appliance::new(site)?;
     if let Some(page) = appliance.page_address() {
         log::say(format_args!("the page: {}\n", page_url(page)));
@@ -116,39 +161,37 @@ pub fn run(options: Options<'_>) -> Result<String> {
         Some(folder) => {
             std::fs::create_dir_all(folder).map_err(failed)?;
             // First: it refuses the folder of an earlier recording.
-            let recorder = recorder.insert(Recorder::create(&mut paced, &folder.join(RECORDING))?);
+            let path = folder.join(RECORDING);
+            let recorder = recorder.insert(Recorder::create(&mut paced, &path, recorder_mib)?);
             demo_kit::write(folder, &scenario, &camera, CONFIG)?;
             recorder
         }
     };
-    let mut records: Vec<ParcelRecord> = Vec::new();
+    let text = introduction(&scenario, options.seconds, listen, options.out);
+    log::say(format_args!("{text}"));
     let (start, mut shown) = (Instant::now(), Instant::now());
     let progress = appliance.run(feed, |progress, new| {
-        records.extend(new);
+        new.for_each(|record| results.add(&scenario, record));
         if shown.elapsed() >= CONSOLE_PERIOD {
             shown = Instant::now();
-            console(progress, start.elapsed(), records.last());
+            console(progress, start.elapsed(), results.last());
         }
-        start.elapsed().as_secs_f64() < options.seconds
+        let over = !endless && start.elapsed().as_secs_f64() >= options.seconds;
+        !over && !stop.load(Ordering::Relaxed)
     })?;
     log::say(format_args!("\n"));
     if let Some(recorder) = recorder {
         log::say(format_args!("{}\n", recorder.finish()?));
     }
-    let mut lines = Vec::new();
-    for record in &records {
-        serde_json::to_writer(&mut lines, record).map_err(|e| failed(e.into()))?;
-        lines.push(b'\n');
-    }
-    std::fs::write(&records_path, lines).map_err(failed)?;
+    results.finish()?;
     let [width, height] = source.size_px();
     let mut frame = vec![0; width * height];
-    for record in &records {
+    for record in results.kept() {
         // The belt is deterministic: the frame where a record holds is rendered once more.
         source.render(record.frame, &mut frame);
         draw(&frame, [width, height], record, &camera, options.out)?;
     }
-    let table = table(source.scenario(), &records, &progress);
+    let table = results.table(&scenario, &progress);
     std::fs::write(options.out.join("table.txt"), &table).map_err(failed)?;
     Ok(table)
 }
@@ -181,71 +224,4 @@ fn console(progress: &Progress, elapsed: Duration, last: Option<&ParcelRecord>) 
         status.counters.parcels,
     );
     log::say(format_args!("\r{line:100}"));
-}
-
-/// The parcel of the scenario that a record is of.
-fn truth(scenario: &Scenario, record: &ParcelRecord) -> Option<Parcel> {
-    let travel_mm = scenario.travel_at_frame_mm(record.frame);
-    let distance = |p: &Parcel| (p.x_mm + travel_mm - record.x_mm).hypot(p.y_mm - record.y_mm);
-    let nearest = scenario.parcels().iter().min_by(|a, b| distance(a).total_cmp(&distance(b)))?;
-    (distance(nearest) < MATCH_MM).then_some(*nearest)
-}
-
-fn table(scenario: &Scenario, records: &[ParcelRecord], progress: &Progress) -> String {
-    let mut text = String::from(
-        "  #      true L x W x H mm     measured L x W x H mm           error mm        2 sigma mm  flags\n",
-    );
-    let (mut sum, mut count, mut worst) = (0.0, 0u32, 0.0f64);
-    for r in records {
-        let measured = [r.length_mm, r.width_mm, r.height_mm];
-        let sigma = [r.sigma_length_mm, r.sigma_width_mm, r.sigma_height_mm];
-        let triple = |v: [f64; 3]| format!("{:6.1} {:6.1} {:6.1}", v[0], v[1], v[2]);
-        let flags = r.flags;
-        let Some(parcel) = truth(scenario, r) else {
-            let _ = writeln!(
-                text,
-                "{:3}  {:>22}    {}   belongs to no parcel  {flags}",
-                r.seq,
-                "-",
-                triple(measured)
-            );
-            continue;
-        };
-        let true_size = [parcel.length_mm, parcel.width_mm, parcel.height_mm];
-        if let Some(reason) = r.not_measured {
-            let _ =
-                writeln!(text, "{:3}   {}      not measured: {reason}", r.seq, triple(true_size));
-            continue;
-        }
-        let error = [0, 1, 2].map(|i| measured[i] - true_size[i]);
-        for e in error.map(f64::abs) {
-            sum += e;
-            count += 1;
-            worst = worst.max(e);
-        }
-        let _ = writeln!(
-            text,
-            "{:3}   {}      {}    {:+6.2} {:+6.2} {:+6.2}   {:4.1} {:4.1} {:4.1}  {flags}",
-            r.seq,
-            triple(true_size),
-            triple(measured),
-            error[0],
-            error[1],
-            error[2],
-            2.0 * sigma[0],
-            2.0 * sigma[1],
-            2.0 * sigma[2],
-        );
-    }
-    let _ = writeln!(
-        text,
-        "{} parcels, mean absolute error {:.2} mm, largest {worst:.2} mm; {} frames, {} dropped, \
-         slowest frame {:.1} ms in the pipeline",
-        records.len(),
-        sum / f64::from(count.max(1)),
-        progress.status.counters.frames,
-        progress.status.frames_dropped,
-        progress.frame_time_max.as_secs_f64() * 1e3,
-    );
-    text
 }

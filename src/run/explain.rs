@@ -49,12 +49,13 @@ impl Explainer {
         let mut plan = Plan::default();
         Views::plan(view, &mut plan);
         Evidence::plan(view, zone, site.height_max_mm, &mut plan);
+        Parcels::plan(view, zone, &mut plan);
         let mib = plan.bytes().div_ceil(1 << 20);
         let mut memory = plan.reserve(mib)?;
         let views = Views::new(view, zone, &mut memory)?;
         let evidence = Evidence::new(view, zone, site.height_max_mm, pipeline.seen(), &mut memory)?;
+        let parcels = Parcels::new(view, zone, &evidence, site.height_max_mm, &mut memory)?;
         memory.seal()?;
-        let parcels = Parcels::new(&evidence, site.height_max_mm);
         let (folder, records, picture) = (folder.to_owned(), Vec::new(), Vec::new());
         Ok(Self { folder, views, evidence, parcels, looked: 0, records, picture, pictured: 0 })
     }
@@ -66,6 +67,7 @@ impl Explainer {
             && let Some(place) = self.views.newest()
         {
             self.evidence.add(&self.views, place);
+            self.parcels.add(self.views.grey(place), pipeline.seen());
         }
         self.evidence.advance(&self.views, at.travel_mm, at.breaks);
         if self.evidence.decided().end - self.looked >= LOOK_COLUMNS {
@@ -76,7 +78,7 @@ impl Explainer {
     fn look(&mut self, pipeline: &Pipeline, end_mm: f64) {
         self.looked = self.evidence.decided().end;
         self.draw();
-        for face in self.parcels.passed(&self.evidence, end_mm) {
+        for face in self.parcels.passed(&self.evidence, &self.views, end_mm) {
             self.record(pipeline, &face);
         }
     }
@@ -138,12 +140,14 @@ impl Explainer {
 fn told_of(face: &Face) -> serde_json::Value {
     let tenths = |value: f64| (10.0 * value).round() / 10.0;
     serde_json::json!({
-        "length_mm": tenths(face.length_mm),
-        "width_mm": tenths(face.width_mm),
+        "length_mm": tenths(face.rectangle.length_mm),
+        "width_mm": tenths(face.rectangle.width_mm),
         "height_mm": tenths(face.height_mm),
-        "yaw_deg": tenths(face.yaw.to_degrees()),
-        "border_share": (1e2 * face.support).round() / 1e2,
+        "yaw_deg": tenths(face.rectangle.yaw.to_degrees()),
+        "border_share": (1e2 * face.rectangle.support()).round() / 1e2,
+        "sides": face.rectangle.sides.map(|share| (1e2 * share).round() / 1e2),
         "cells": face.cells,
+        "stacked": face.stacked,
     })
 }
 

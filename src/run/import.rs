@@ -5,6 +5,7 @@ use crate::camera::LensModel;
 use crate::camera::chessboard::Chessboard;
 use crate::config::{Config, Site};
 use crate::error::{Error, Result};
+use crate::source::check_interface;
 use crate::store::manifest::MANIFEST;
 use crate::store::stick::{
     BELT_FOLDER, FILE_BYTES_MAX, LENS_FOLDER, STILLS_BYTES_MAX, STILLS_MAX, Stick, TEXT_BYTES_MAX,
@@ -139,6 +140,7 @@ fn stage(stick: &mut Stick, locked: &Locked<'_>, report: &mut Report) -> Result<
     let on_stick = stick.path().join(CONFIG_FILE);
     let config = Config::parse(&text).map_err(|e| e.in_file(&on_stick))?;
     check_names(&config).map_err(|e| e.in_file(&on_stick))?;
+    check_interface(config.camera.interface).map_err(|e| e.in_file(&on_stick))?;
     let staging = locked.stage()?;
     save(&staging.join(CONFIG_FILE), text.as_bytes())?;
     let camera = &config.camera.calibration;

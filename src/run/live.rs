@@ -1,12 +1,12 @@
 //! `beltgauge run`: the appliance on a live camera, until it is told to stop.
 
-use super::{Appliance, ImportBoard, Progress, Watchdog, log};
+use super::{Appliance, ImportBoard, Progress, Watchdog, log, memory};
 use crate::config::{Can, Site};
 use crate::error::{Error, Result};
 use crate::event::ParcelRecord;
 use crate::plc::interface;
 use crate::plc::registers::ImportStatus;
-use crate::source::{Feed, Live, Recorder, open_camera};
+use crate::source::{Feed, Live, Recorder, check_interface, open_camera};
 use crate::store::{ImportRecord, Store};
 use serde::Serialize;
 use signal_hook::consts::{SIGINT, SIGTERM};
@@ -45,6 +45,7 @@ pub fn run(options: &Options<'_>) -> Result<()> {
         store.settle();
     }
     let mut site = options.config.map_or_else(|| store.site(), Site::load)?;
+    check_interface(site.config.camera.interface)?;
     if options.config.is_none() {
         site.config.plc.state_file.get_or_insert_with(|| store.plc_state());
         site.config.archive.folder.get_or_insert_with(|| store.archive());
@@ -55,7 +56,10 @@ pub fn run(options: &Options<'_>) -> Result<()> {
     let mut recorder = None;
     let feed: &mut dyn Feed = match options.record {
         None => &mut live,
-        Some(path) => recorder.insert(Recorder::create(&mut live, path)?),
+        Some(path) => {
+            let mib = memory::room_for_recorder(&site)?;
+            recorder.insert(Recorder::create(&mut live, path, mib)?)
+        }
     };
     let listen = site.config.modbus.listen;
     let watchdog = Watchdog::new(options.watchdog)?;

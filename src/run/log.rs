@@ -5,12 +5,17 @@
 
 use std::io::Write;
 use std::sync::OnceLock;
+use std::sync::mpsc::sync_channel;
+use std::time::Duration;
 use tracing::Level;
 use tracing_appender::non_blocking::{NonBlocking, NonBlockingBuilder, WorkerGuard};
 use tracing_subscriber::EnvFilter;
 
 /// Lines that wait to be read; a line is some 200 bytes.
 const LINES_MAX: usize = 4096;
+
+/// Whoever reads has taken the last words within this, or does not read.
+const FAREWELL: Duration = Duration::from_secs(10);
 
 static STDERR: OnceLock<NonBlocking> = OnceLock::new();
 
@@ -49,6 +54,19 @@ pub fn say(text: std::fmt::Arguments<'_>) {
         // Not started: a test.
         None => std::io::stderr().write_all(text.as_bytes()),
     };
+}
+
+/// Write to standard error and wait until it is written, which a busy computer takes its time for; not for
+/// ever, when nobody reads.
+pub fn last_words(text: String) {
+    let (tell, told) = sync_channel(1);
+    let writer = std::thread::Builder::new().name("last words".into()).spawn(move || {
+        let _ = std::io::stderr().write_all(text.as_bytes());
+        let _ = tell.send(());
+    });
+    if writer.is_ok() {
+        let _ = told.recv_timeout(FAREWELL);
+    }
 }
 
 /// Lines that were dropped since start because nobody read.

@@ -5,6 +5,7 @@ use crate::error::Result;
 use crate::pipeline::Pipeline;
 use crate::plan::{Block, Plan};
 use crate::run::desk::shots::{self, Shot};
+use crate::source::Recorder;
 
 /// Every buffer of the capture and vision path, as `beltgauge check` prints it.
 pub fn plan(site: &Site) -> Plan {
@@ -46,4 +47,13 @@ pub fn build(mut site: Site) -> Result<(Vec<Block<u8>>, Pipeline)> {
     site.config.archive.folder = None;
     let Carved { buffers, pipeline, .. } = carve(site)?;
     Ok((buffers, pipeline))
+}
+
+/// What a recorder beside all of it may take, MiB. The sum of both is refused as one plan.
+pub fn room_for_recorder(site: &Site) -> Result<usize> {
+    let mut plan = plan(site);
+    let planned = plan.bytes();
+    Recorder::plan(site.camera.image_size_px, &mut plan);
+    plan.check_limit(site.config.limits.memory_mib_max)?;
+    Ok((plan.bytes() - planned).div_ceil(1 << 20))
 }

@@ -9,6 +9,7 @@ pub mod budget;
 pub mod calibrate;
 pub mod demo;
 mod demo_kit;
+mod demo_results;
 mod desk;
 mod explain;
 pub mod import;

@@ -1,7 +1,9 @@
 //! The watchdog: every thread beats; one that stands still ends the program, and with it the feeding
-//! of the hardware watchdog, which restarts the machine if nobody else restarts the program.
+//! of the hardware watchdog, which restarts the machine if nobody else restarts the program. systemd's
+//! watchdog is fed beside it.
 
 use crate::error::{Error, Result};
+use sd_notify::NotifyState;
 use std::fs::File;
 use std::io::Write;
 use std::path::Path;
@@ -99,6 +101,8 @@ impl Watchdog {
         }
         if self.fed.is_none_or(|fed| now - fed >= FEEDING) {
             self.fed = Some(now);
+            // Of systemd, if it started this program and waits for it.
+            let _ = sd_notify::notify(&[NotifyState::Ready, NotifyState::Watchdog]);
             if let Some(hardware) = &mut self.hardware {
                 // It bites when this goes on failing: that is its purpose.
                 let _ = hardware.write_all(b"\0");
@@ -136,6 +140,9 @@ impl Watchdog {
 
     /// The program ends in order: the machine need not be restarted.
     pub fn disarm(&mut self) {
+        if self.watches {
+            let _ = sd_notify::notify(&[NotifyState::Stopping]);
+        }
         if let Some(hardware) = &mut self.hardware {
             // The kernel's sign for it (Documentation/watchdog/watchdog-api.rst).
             let _ = hardware.write_all(b"V");

@@ -74,9 +74,31 @@ pub fn open_camera(settings: &CameraTable, size_px: [usize; 2]) -> Result<Box<dy
         #[cfg(feature = "aravis")]
         Interface::Aravis => Ok(Box::new(aravis::Aravis::open(settings, size_px)?)),
         #[allow(unreachable_patterns)] // with every feature there is none left
-        _ => Err(Error::configuration("camera.interface: this program was built without it")
-            .remedy("choose another interface, or build with the cargo feature of its name")),
+        missing => Err(not_built_in(missing)),
     }
+}
+
+/// The interfaces to cameras, their names, and whether this program has them.
+const INTERFACES: [(Interface, &str, bool); 3] = [
+    (Interface::V4l2, "v4l2", cfg!(feature = "v4l2")),
+    (Interface::Gige, "gige", true),
+    (Interface::Aravis, "aravis", cfg!(feature = "aravis")),
+];
+
+/// Refuse an interface that this program was built without: waiting for such a camera is in vain.
+pub fn check_interface(interface: Interface) -> Result<()> {
+    let is_built_in = INTERFACES.iter().any(|&(known, _, there)| there && known == interface);
+    if is_built_in { Ok(()) } else { Err(not_built_in(interface)) }
+}
+
+fn not_built_in(interface: Interface) -> Error {
+    let name = INTERFACES.iter().find(|i| i.0 == interface).map_or("", |i| i.1);
+    let there: Vec<&str> = INTERFACES.iter().filter(|i| i.2).map(|i| i.1).collect();
+    Error::configuration(format!(
+        "camera.interface = \"{name}\": this program was built without the feature {name}"
+    ))
+    .allowed(there.join(", "))
+    .remedy(format!("choose one of these, or `cargo build --release --features {name}`"))
 }
 
 /// Open a replay: a Y4M file, `-` for Y4M on standard input, or a directory of images.
@@ -91,7 +113,7 @@ pub fn open(input: &Path, fps: Option<f64>) -> Result<Box<dyn FrameSource>> {
         )));
     }
     if input == Path::new("-") {
-        let y4m = Y4m::new(Box::new(std::io::stdin()), "standard input", fps)?;
+        let y4m = Y4m::new(Box::new(std::io::stdin()), y4m::STDIN, fps)?;
         return Ok(Box::new(WithoutRepeats::new(y4m)));
     }
     let metadata = std::fs::metadata(input).map_err(|e| {

@@ -7,7 +7,7 @@ use super::times::{HEADER, times_beside};
 use super::{Feed, FeedStatus, Next, Taken};
 use crate::error::{Error, Result};
 use crate::image::FrameTime;
-use crate::plan::Block;
+use crate::plan::{Block, Plan};
 use std::fs::{File, OpenOptions};
 use std::io::{Seek, SeekFrom, Write};
 use std::path::{Path, PathBuf};
@@ -18,6 +18,8 @@ use std::time::{Duration, Instant};
 
 /// Frames that wait for the disk: most of a second of the reference camera.
 const RING: usize = 32;
+/// Their name in the memory plan.
+const FRAMES: &str = "recorder.frames";
 /// Losses are told this often at most.
 const TELL_EVERY: Duration = Duration::from_secs(10);
 /// How long a disk may take for what is in the ring at the end.
@@ -27,7 +29,7 @@ const RATE_UNKNOWN: f64 = 25.0;
 
 /// A frame on its way to the disk.
 struct Frame {
-    pixels: Vec<u8>,
+    pixels: Block<u8>,
     time: FrameTime,
 }
 
@@ -61,8 +63,16 @@ impl std::fmt::Display for Recorded {
 }
 
 impl<'a> Recorder<'a> {
-    /// Record the frames of `feed` into a new file and its times beside it. All memory is taken now.
-    pub fn create(feed: &'a mut dyn Feed, path: &Path) -> Result<Self> {
+    /// Demand the ring of a recorder of frames of this size.
+    pub fn plan(size_px: [usize; 2], plan: &mut Plan) {
+        let bytes: usize = size_px.iter().product();
+        plan.add::<u8>(FRAMES, RING * bytes, "raw frames that wait for the recorder's disk");
+    }
+
+    /// Record the frames of `feed` into a new file and its times beside it. All memory is taken now: as
+    /// [`Recorder::plan`] says, up to `mib_max`.
+    pub fn create(feed: &'a mut dyn Feed, path: &Path, mib_max: usize) -> Result<Self> {
+        let ring = ring(feed.size_px(), mib_max)?;
         let create = |path: &Path| {
             OpenOptions::new().write(true).create_new(true).open(path).map_err(|e| {
                 Error::configuration(format!("--record: cannot create the recording: {e}"))
@@ -79,20 +89,20 @@ impl<'a> Recorder<'a> {
             last: FrameTime::default(),
             written: 0,
         };
-        Self::start(feed, path, files)
+        Self::start(feed, path, files, ring)
     }
 
     fn start<W: Write + Seek + Send + 'static>(
         feed: &'a mut dyn Feed,
         path: &Path,
         files: Files<W>,
+        ring: Vec<Block<u8>>,
     ) -> Result<Self> {
-        let bytes = files.size_px.iter().product();
         let (give_back, free) = sync_channel(RING);
         let (ready, frames) = sync_channel(RING);
-        for _ in 0..RING {
-            // The ring has room for all of them. Written to, so that the memory is there.
-            let frame = Frame { pixels: vec![1; bytes], time: FrameTime::default() };
+        for pixels in ring {
+            // There is room for all of them.
+            let frame = Frame { pixels, time: FrameTime::default() };
             let _ = give_back.try_send(frame);
         }
         let (tell_end, ended) = sync_channel(1);
@@ -162,6 +172,16 @@ impl Feed for Recorder<'_> {
     fn status(&self) -> FeedStatus {
         self.feed.status()
     }
+}
+
+/// The frames of the ring.
+fn ring(size_px: [usize; 2], mib_max: usize) -> Result<Vec<Block<u8>>> {
+    let mut plan = Plan::default();
+    Recorder::plan(size_px, &mut plan);
+    let mut memory = plan.reserve(mib_max)?;
+    let frames = memory.take_parts(FRAMES, RING, 0)?;
+    memory.seal()?;
+    Ok(frames)
 }
 
 /// The thread behind the ring.
@@ -287,7 +307,7 @@ mod tests {
         let path = scratch("recorder").join("a.y4m");
         let mut source = Counting(3);
         let mut feed = Paced::new(&mut source, Pace::Unhurried);
-        let mut recorder = Recorder::create(&mut feed, &path).expect("room");
+        let mut recorder = Recorder::create(&mut feed, &path, 1).expect("room");
         let mut buffer = Block::own(32 * 16).expect("small");
         let mut passed = Vec::new();
         for _ in 0..RING {
@@ -315,9 +335,33 @@ mod tests {
         std::fs::write(&path, "mine").expect("room");
         let mut source = Counting(0);
         let mut feed = Paced::new(&mut source, Pace::Unhurried);
-        let error = Recorder::create(&mut feed, &path).err().expect("refused").to_string();
+        let error = Recorder::create(&mut feed, &path, 1).err().expect("refused").to_string();
         assert!(error.contains("a.y4m") && error.contains("another name"), "{error}");
         assert_eq!(std::fs::read_to_string(&path).expect("there"), "mine");
+    }
+
+    #[test]
+    fn a_ring_beyond_the_memory_that_is_allowed_is_refused_before_any_file_is_made() {
+        struct Large;
+        impl Feed for Large {
+            fn size_px(&self) -> [usize; 2] {
+                [1024, 1024]
+            }
+            fn next(&mut self, _: &mut Block<u8>) -> Result<Next> {
+                Ok(Next::End)
+            }
+            fn skip(&mut self) -> Result<u64> {
+                Ok(0)
+            }
+            fn status(&self) -> FeedStatus {
+                FeedStatus::default()
+            }
+        }
+        let path = scratch("recorder-large").join("a.y4m");
+        let error = Recorder::create(&mut Large, &path, 31).err().expect("refused").to_string();
+        assert!(error.contains("memory_mib_max") && error.contains("recorder.frames"), "{error}");
+        assert!(!path.exists());
+        assert!(Recorder::create(&mut Large, &path, 32).is_ok());
     }
 
     /// A disk that takes nothing while it is held, and fails when it is full.
@@ -352,7 +396,9 @@ mod tests {
         let mut source = Counting(0);
         let mut feed = Paced::new(&mut source, Pace::Unhurried);
         let files = files(&gate, usize::MAX);
-        let mut recorder = Recorder::start(&mut feed, Path::new("slow"), files).expect("a thread");
+        let mut recorder =
+            Recorder::start(&mut feed, Path::new("slow"), files, ring([32, 16], 1).expect("small"))
+                .expect("a thread");
         let mut buffer = Block::own(32 * 16).expect("small");
         let held = gate.lock();
         for _ in 0..3 * RING {
@@ -369,7 +415,9 @@ mod tests {
         let mut source = Counting(0);
         let mut feed = Paced::new(&mut source, Pace::Unhurried);
         let files = files(&gate, 4000);
-        let mut recorder = Recorder::start(&mut feed, Path::new("full"), files).expect("a thread");
+        let mut recorder =
+            Recorder::start(&mut feed, Path::new("full"), files, ring([32, 16], 1).expect("small"))
+                .expect("a thread");
         let mut buffer = Block::own(32 * 16).expect("small");
         for _ in 0..3 * RING {
             assert!(matches!(recorder.next(&mut buffer), Ok(Next::Frame(_))));

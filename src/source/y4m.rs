@@ -7,8 +7,24 @@ use crate::error::{Error, Result};
 use crate::image::FrameTime;
 use std::io::{BufRead, BufReader, Read};
 
+/// What standard input is called.
+pub(super) const STDIN: &str = "standard input";
 /// Longer header lines are not Y4M.
 const LINE_BYTES_MAX: u64 = 1024;
+
+/// The whole line that measures any video. `filter` is ffmpeg's, or nothing.
+fn through_ffmpeg(name: &str, filter: &str) -> String {
+    let plain = |c: char| c.is_ascii_alphanumeric() || "/._-+".contains(c);
+    let input = match name {
+        STDIN => "INPUT".to_owned(),
+        _ if name.chars().all(plain) => name.to_owned(),
+        _ => format!("'{}'", name.replace('\'', r"'\''")),
+    };
+    format!(
+        "ffmpeg -v error -i {input} {filter}-pix_fmt gray -f yuv4mpegpipe -strict -1 - | \
+         beltgauge measure - --config FILE"
+    )
+}
 
 /// A Y4M stream.
 pub struct Y4m {
@@ -29,7 +45,7 @@ impl Y4m {
             Error::configuration(what)
                 .at(name)
                 .allowed("YUV4MPEG2 with W, H, F; 8-bit mono or 4:2:0 (Cmono, C420, C420jpeg, C420mpeg2, C420paldv)")
-                .remedy("ffmpeg -i INPUT -pix_fmt gray -f yuv4mpegpipe -strict -1 -")
+                .remedy(through_ffmpeg(name, ""))
         };
         let line = read_line(&mut reader)
             .map_err(|e| Error::failure(format!("cannot read: {e}")).at(name))?
@@ -55,9 +71,7 @@ impl Y4m {
                         "the stream is interlaced, I{value}: each frame is two pictures of \
                          different times, row by row"
                     ))
-                    .remedy(
-                        "ffmpeg -i INPUT -vf yadif=1 -pix_fmt gray -f yuv4mpegpipe -strict -1 -",
-                    ));
+                    .remedy(through_ffmpeg(name, "-vf yadif=1 ")));
                 }
                 _ => {}
             }

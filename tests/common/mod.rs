@@ -40,17 +40,38 @@ pub fn shared_data(part: &str) -> Option<PathBuf> {
     None
 }
 
+/// A camera straight above the belt's origin as a camera file says it, the axis in the middle of the image.
+pub fn camera_file(
+    [width, height]: [usize; 2],
+    focal_px: f64,
+    height_mm: f64,
+    distortion: [f64; 5],
+) -> String {
+    let [cx_px, cy_px] = [width, height].map(|n| 0.5 * (n as f64 - 1.0));
+    format!(
+        "image_size_px = [{width}, {height}]\n\
+         [lens]\nmodel = \"brown\"\nfx_px = {focal_px}\nfy_px = {focal_px}\ncx_px = {cx_px}\n\
+         cy_px = {cy_px}\ndistortion = {distortion:?}\n\
+         [pose]\nrotation = [[1, 0, 0], [0, -1, 0], [0, 0, -1]]\ntranslation_mm = [0, 0, {height_mm}]\n"
+    )
+}
+
+/// The same camera in a scenario.
+pub fn camera_above(
+    size_px: [usize; 2],
+    focal_px: f64,
+    height_mm: f64,
+    distortion: [f64; 5],
+) -> String {
+    let file = camera_file(size_px, focal_px, height_mm, distortion);
+    format!("[camera]\n{file}")
+        .replace("[lens]", "[camera.lens]")
+        .replace("[pose]", "[camera.pose]")
+}
+
 /// A camera straight above a belt, and a configuration for it, written into `folder`.
 pub fn write_site(folder: &Path, image_size_px: [usize; 2]) -> PathBuf {
-    let [width, height] = image_size_px;
-    let camera = format!(
-        "image_size_px = [{width}, {height}]\n\
-         [lens]\nmodel = \"brown\"\nfx_px = 500\nfy_px = 500\ncx_px = {}\ncy_px = {}\n\
-         distortion = [0, 0, 0, 0, 0]\n\
-         [pose]\nrotation = [[1, 0, 0], [0, -1, 0], [0, 0, -1]]\ntranslation_mm = [0, 0, 1500]\n",
-        width / 2,
-        height / 2
-    );
+    let camera = camera_file(image_size_px, 500.0, 1500.0, [0.0; 5]);
     std::fs::write(folder.join("camera.toml"), camera).expect("writable");
     let config = "[camera]\ncalibration = \"camera.toml\"\n\
                   [zone]\nx_min_mm = -300\nx_max_mm = 300\ny_min_mm = -200\ny_max_mm = 200\n\

@@ -1,15 +1,15 @@
 //! What is on the belt of a world, and what comes into its picture besides.
 
 use super::class::{Class, Property};
-use super::generator::ZONE_HALF_MM;
+use super::generator::Room;
 use beltgauge::source::synthetic::{Random, Scenario};
 use std::fmt::Write as _;
 
 pub const HEIGHT_MAX_MM: f64 = 500.0;
 /// A parcel taller than this times its width falls over.
 const SLENDER_MAX: f64 = 1.5;
-/// What is wider leaves the zone at its sides.
-const ACROSS_MAX_MM: f64 = 500.0;
+/// What is nearer to the zone's sides than this leaves it.
+const BESIDE_MM: f64 = 30.0;
 
 const MATERIALS: [&str; 5] = ["kraft", "white", "dark", "glossy", "printed"];
 
@@ -18,7 +18,7 @@ fn choice<'a>(random: &mut Random, of: &[&'a str]) -> &'a str {
 }
 
 /// Between ends, evenly in the logarithm.
-fn ratio(random: &mut Random, range: [f64; 2]) -> f64 {
+pub fn ratio(random: &mut Random, range: [f64; 2]) -> f64 {
     random.between(range.map(f64::ln)).exp()
 }
 
@@ -29,11 +29,16 @@ struct Body {
 }
 
 impl Body {
-    fn draw(class: Class, has_any_size: bool, across_max_mm: f64, random: &mut Random) -> Self {
+    fn draw(
+        class: Class,
+        has_any_size: bool,
+        [across_max_mm, height_max_mm]: [f64; 2],
+        random: &mut Random,
+    ) -> Self {
         let (sides, heights) = match class {
-            _ if has_any_size => ([20.0, 800.0], [3.0, HEIGHT_MAX_MM]),
+            _ if has_any_size => ([20.0, 800.0], [3.0, height_max_mm]),
             Class::Easy => ([80.0, 300.0], [10.0, 250.0]),
-            _ => ([60.0, 300.0], [4.0, 250.0]),
+            _ => ([60.0, 300.0], [4.0, height_max_mm.min(250.0)]),
         };
         let (a, b) = (ratio(random, sides), ratio(random, sides));
         let width = a.min(b).min(across_max_mm);
@@ -61,7 +66,7 @@ impl Body {
 }
 
 /// Parcels, all of them inside the zone's sides, and where the last one ends.
-pub fn parcels(of: &impl Fn(Property) -> (Class, Random)) -> (String, f64) {
+pub fn parcels(of: &impl Fn(Property) -> (Class, Random), room: &Room) -> (String, f64) {
     let (class, mut random) = of(Property::Parcels);
     let (start_class, mut start) = of(Property::Start);
     let (shape_class, mut shapes) = of(Property::Shapes);
@@ -78,12 +83,15 @@ pub fn parcels(of: &impl Fn(Property) -> (Class, Random)) -> (String, f64) {
     let mut text = String::new();
     // Some worlds have parcels on the belt in their first frame.
     let on_belt = start_class.has(Class::Periodic);
-    let first_mm = if on_belt { start.between([0.0, 350.0]) } else { -ZONE_HALF_MM[0] - 500.0 };
+    let [half_x_mm, half_y_mm] = room.half_mm;
+    let first_mm = if on_belt { start.between([0.0, 350.0]) } else { -half_x_mm - 500.0 };
+    let zone_mm = 2.0 * (half_y_mm - BESIDE_MM);
     let mut ends_mm = [first_mm; 2];
     for k in 0..count {
         let lane = k % lanes;
-        let across_max_mm = if lanes == 2 { ACROSS_MAX_MM / 2.0 } else { ACROSS_MAX_MM };
-        let body = Body::draw(class, any_size, across_max_mm, &mut random);
+        let across_max_mm = zone_mm / lanes as f64;
+        let most = [across_max_mm, room.height_max_mm];
+        let body = Body::draw(class, any_size, most, &mut random);
         let [half_x_mm, half_y_mm] = body.reach_mm();
         let [l, w, h] = body.sides_mm;
         let room_mm = 0.5 * across_max_mm - half_y_mm;
@@ -100,7 +108,7 @@ pub fn parcels(of: &impl Fn(Property) -> (Class, Random)) -> (String, f64) {
             middle_mm + random.between([-room_mm, room_mm])
         );
         text += &shape(shape_class, &mut shapes);
-        text += &clothes(dress_class, &mut dress);
+        text += &clothes(dress_class, [w, h], &mut dress);
         text += &movement(slip_class, &mut slip);
         ends_mm[lane] -= 2.0 * half_x_mm + gap_mm;
     }
@@ -108,7 +116,7 @@ pub fn parcels(of: &impl Fn(Property) -> (Class, Random)) -> (String, f64) {
 }
 
 /// Frames until every parcel is well beyond the zone.
-pub fn frames_until_all_have_left(scenario: &Scenario) -> u64 {
+pub fn frames_until_all_have_left(scenario: &Scenario, room: &Room) -> u64 {
     const FRAMES_MAX: u64 = 4000;
     const BEYOND_MM: f64 = 60.0;
     let inside = |frame: u64| {
@@ -118,7 +126,7 @@ pub fn frames_until_all_have_left(scenario: &Scenario) -> u64 {
                 sides_mm: [parcel.length_mm, parcel.width_mm, parcel.height_mm],
                 yaw_deg: place.yaw_deg,
             };
-            place.x_mm - body.reach_mm()[0] < ZONE_HALF_MM[0] + BEYOND_MM
+            place.x_mm - body.reach_mm()[0] < room.half_mm[0] + BEYOND_MM
         })
     };
     (0..FRAMES_MAX).find(|frame| !inside(*frame)).expect("the belt moves")
@@ -130,19 +138,32 @@ fn shape(class: Class, random: &mut Random) -> String {
     if class.has(Class::Shapes) { format!("shape = \"{name}\"\n") } else { String::new() }
 }
 
-/// Straps, shrink-wrap, tape, a label near the edge.
-fn clothes(class: Class, random: &mut Random) -> String {
+/// Edges; straps, shrink-wrap, tape, a label near the edge; a corner that was pressed in.
+fn clothes(class: Class, [width_mm, height_mm]: [f64; 2], random: &mut Random) -> String {
+    let radius_mm = ratio(random, [0.5, 4.0]);
+    let pressed_mm = random.between([4.0, 20.0]).min(0.3 * width_mm.min(height_mm));
+    let is_crushed = random.unit() < 0.2;
     let straps = if random.unit() < 0.3 { 1 + (random.unit() * 2.0) as u8 } else { 0 };
     let wrap = random.unit() - 0.6;
     let edge_mm = random.between([0.5, 20.0]);
     let (has_label, has_tape) = (random.unit() < 0.5, random.unit() < 0.3);
-    if !class.has(Class::Shapes) {
+    if class == Class::Easy {
         return String::new();
     }
-    let mut text =
-        format!("straps = {straps}\nwrap = {}\ntape = {has_tape}\n", (2.5 * wrap).clamp(0.0, 1.0));
+    let edges = format!("edge_radius_mm = {radius_mm}\n");
+    if !class.has(Class::Shapes) {
+        return edges;
+    }
+    let mut text = edges
+        + &format!(
+            "straps = {straps}\nwrap = {}\ntape = {has_tape}\n",
+            (2.5 * wrap).clamp(0.0, 1.0)
+        );
     if has_label {
         let _ = writeln!(text, "label_edge_mm = {edge_mm}");
+    }
+    if is_crushed {
+        let _ = writeln!(text, "crush_mm = {pressed_mm}");
     }
     text
 }
@@ -160,7 +181,7 @@ fn movement(class: Class, random: &mut Random) -> String {
 }
 
 /// Hands, sleeves and cables.
-pub fn visitors((class, mut random): (Class, Random), seconds: f64) -> String {
+pub fn visitors((class, mut random): (Class, Random), seconds: f64, room: &Room) -> String {
     let mut text = String::new();
     if !class.has(Class::Visited) {
         return text;
@@ -168,17 +189,17 @@ pub fn visitors((class, mut random): (Class, Random), seconds: f64) -> String {
     for _ in 0..=(random.unit() * 2.0) as usize {
         let from_s = random.between([0.3, 0.8]) * seconds;
         if random.unit() < 0.3 {
-            text += &cable(&mut random);
+            text += &cable(&mut random, room.height_max_mm);
         } else {
-            text += &arm(&mut random, from_s);
+            text += &arm(&mut random, from_s, room.height_max_mm);
         }
     }
     text
 }
 
 /// It hangs over the belt and swings.
-fn cable(random: &mut Random) -> String {
-    let (x, z) = (random.between([-350.0, 350.0]), random.between([520.0, 800.0]));
+fn cable(random: &mut Random, above_mm: f64) -> String {
+    let (x, z) = (random.between([-350.0, 350.0]), above_mm + random.between([20.0, 300.0]));
     format!(
         "[[intruder]]\nfrom_s = 0\nto_s = 1000\nvelocity_mm_per_s = [0, 0, 0]\nswing_mm = [{}, 0, 0]\n\
          swing_period_s = 1.6\n[[intruder.rod]]\nfrom_mm = [{x}, -600, {z}]\nto_mm = [{}, 600, {z}]\n\
@@ -191,9 +212,9 @@ fn cable(random: &mut Random) -> String {
 }
 
 /// A sleeve with a hand that reaches in from a side and goes again.
-fn arm(random: &mut Random, from_s: f64) -> String {
+fn arm(random: &mut Random, from_s: f64, above_mm: f64) -> String {
     let side = if random.unit() < 0.5 { 1.0 } else { -1.0 };
-    let (x, z) = (random.between([-300.0, 300.0]), random.between([510.0, 650.0]));
+    let (x, z) = (random.between([-300.0, 300.0]), above_mm + random.between([55.0, 150.0]));
     let reach = random.between([150.0, 450.0]);
     // In and out again: a swing of half a period.
     let lasts_s = random.between([0.8, 2.0]);

@@ -50,8 +50,7 @@ fn appliance(listen: SocketAddr, seconds: u64) {
     let parcels = (PARCELS_PER_S * seconds).clamp(500, 100_000);
     let scenario = std::fs::read_to_string(hil::project().join("config/demo/scenario.toml"))
         .expect("committed")
-        .replace("count = 500", &format!("count = {parcels}"))
-        .replace("frames = 100000", "frames = 100000000");
+        .replace("count = 500", &format!("count = {parcels}"));
     let scenario = Scenario::parse(&scenario).expect("the demo's");
     let mut site = demo::site(&scenario).expect("the demo's");
     (site.config.modbus.listen, site.config.plc.queue) = (listen, true);

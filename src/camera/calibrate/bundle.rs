@@ -66,7 +66,7 @@ impl Bundle<'_> {
         (squares.iter().sum::<f64>() / squares.len() as f64).sqrt()
     }
 
-    fn pose_column(&self, view: usize) -> usize {
+    pub(super) fn pose_column(&self, view: usize) -> usize {
         LENS_PARAMETERS + 3 * self.shape_mm.len() + 6 * view
     }
 

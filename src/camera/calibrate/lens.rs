@@ -4,7 +4,7 @@ use super::Pose;
 use super::bundle::{Bundle, Observation, View, board_pose};
 use super::homography::{homography, zhang};
 use super::least_squares::{Normal, minimise};
-use super::turned::{TurnedView, turned_back_rms_px, turned_views};
+use super::turned::{turned_back, turned_views};
 use super::verdict;
 use crate::camera::chessboard::{BoardImage, Chessboard, Corner};
 use crate::camera::{LENS_PARAMETERS, Lens, LensModel};
@@ -38,6 +38,8 @@ pub struct ViewResult {
     pub rms_px: Option<f64>,
     /// Why it is not part of the result.
     pub rejected: Option<String>,
+    /// It was turned by 180 degrees against the others, and is told of as turned back.
+    pub is_turned: bool,
     /// Each corner and its error (seen minus expected), px; outliers included.
     pub residuals: Vec<(Corner, Vector2<f64>)>,
     /// Corners left out because they do not belong.
@@ -96,20 +98,15 @@ pub fn calibrate_lens(
 ) -> Result<LensCalibration> {
     let settle = |look| settle(board, image_size_px, images, model, start, shape, look);
     let mut settled = settle(LookForTurned::Yes)?;
-    // Of another camera, or of no one lens at all, a turned view would not fit the others either.
-    let fits = |&v: &usize| {
-        let error_px = turned_back_rms_px(board, image_size_px, &settled.fitted, &images[v]);
-        error_px.is_some_and(|rms| {
-            !verdict::is_bad(&settled.fitted.view_rms_px, rms, VIEW_RATIO, VIEW_RMS_PX)
-        })
-    };
-    if !settled.turned.iter().all(fits) {
+    // Of another camera, or of no one lens at all, a view does not fit turned back either.
+    if settled.is_turned.iter().zip(&settled.rejected).any(|(turned, why)| *turned && why.is_some())
+    {
         settled = settle(LookForTurned::No)?;
     }
-    let Settled { rejected, kept, fitted, turned } = settled;
-    let mut calibration = summarise(board, images, &rejected, &kept, &fitted)?;
-    verdict::check(board, image_size_px, images, &kept, start, &mut calibration)?;
-    calibration.warnings.extend(verdict::turned_warning(turned.len()));
+    let mut calibration = summarise(board, &settled)?;
+    let Settled { seen, kept, is_turned, .. } = settled;
+    verdict::check(board, image_size_px, &seen, &kept, start, &mut calibration)?;
+    calibration.warnings.extend(verdict::turned_warning(&is_turned));
     Ok(calibration)
 }
 
@@ -123,12 +120,14 @@ enum LookForTurned {
 /// A fit of what belongs together.
 struct Settled {
     fitted: Fitted,
+    /// What was seen in each view, turned back where it was turned.
+    seen: Vec<BoardImage>,
+    /// Which were.
+    is_turned: Vec<bool>,
     /// Numbers of the views fitted.
     kept: Vec<usize>,
     /// Why others are not.
     rejected: Vec<Option<String>>,
-    /// Those that seem to be turned.
-    turned: Vec<usize>,
 }
 
 /// Fit, reject the view that belongs least, and again, until all belong.
@@ -142,7 +141,7 @@ fn settle(
     look: LookForTurned,
 ) -> Result<Settled> {
     let mut rejected = verdict::unusable(images, SMEAR_PX_MAX, VIEWS_MIN);
-    let mut turned = Vec::new();
+    let (mut seen, mut is_turned) = (images.to_vec(), vec![false; images.len()]);
     let mut found: Option<(Lens, Vec<Pose>)> = None;
     let mut look = look;
     loop {
@@ -150,36 +149,33 @@ fn settle(
         if kept.len() < VIEWS_MIN {
             return Err(verdict::too_few_views(kept.len(), VIEWS_MIN));
         }
-        let views: Vec<View> = kept.iter().map(|&v| View::all_of(&images[v])).collect();
+        let views: Vec<View> = kept.iter().map(|&v| View::all_of(&seen[v])).collect();
         let first = match found.take() {
             Some(found) => found,
             None => initial(board, image_size_px, &views, model, start)?,
         };
         let mut fitted = fit(board, views, first, shape)?;
         if std::mem::replace(&mut look, LookForTurned::No) == LookForTurned::Yes {
-            let seen: Vec<BoardImage> = kept.iter().map(|&v| images[v].clone()).collect();
+            let fitted_images: Vec<BoardImage> = kept.iter().map(|&v| seen[v].clone()).collect();
             let refit = |images: &[BoardImage], lens: &Lens| {
                 let poses: Option<Vec<Pose>> =
                     images.iter().map(|i| board_pose(board, lens, &i.corners)).collect();
                 let views = images.iter().map(View::all_of).collect();
                 fit(board, views, (lens.clone(), poses?), shape).ok()
             };
-            let (all, rms_px) =
-                turned_views(board, image_size_px, &seen, &fitted, &refit).unwrap_or_default();
-            // What does not fit turned back either has another fault.
-            let belongs =
-                |t: &TurnedView| !verdict::is_bad(&rms_px, t.rms_px[1], VIEW_RATIO, VIEW_RMS_PX);
-            for back in all.iter().filter(|t| belongs(t)) {
-                turned.push(kept[back.view]);
-                rejected[kept[back.view]] = Some(verdict::is_turned(back));
+            let turned = turned_views(board, image_size_px, &fitted_images, &fitted, &refit);
+            let turned = turned.unwrap_or_default();
+            for (&v, _) in kept.iter().zip(&turned).filter(|(_, turned)| **turned) {
+                seen[v] = turned_back(board, image_size_px, &seen[v]);
+                is_turned[v] = true;
             }
-            if !turned.is_empty() {
+            if turned.contains(&true) {
                 continue;
             }
         }
         let worst = verdict::worst_view(&fitted, VIEW_RATIO, VIEW_RMS_PX);
         match worst.filter(|_| kept.len() > VIEWS_MIN) {
-            None => return Ok(Settled { fitted, kept, rejected, turned }),
+            None => return Ok(Settled { fitted, seen, is_turned, kept, rejected }),
             Some((worst, reason)) => {
                 rejected[kept[worst]] = Some(reason);
                 fitted.poses.remove(worst);
@@ -368,20 +364,15 @@ fn residuals<'a>(bundle: &'a Bundle<'_>) -> impl Iterator<Item = Vector2<f64>> +
     })
 }
 
-fn summarise(
-    board: &Chessboard,
-    images: &[BoardImage],
-    rejected: &[Option<String>],
-    kept: &[usize],
-    fitted: &Fitted,
-) -> Result<LensCalibration> {
+fn summarise(board: &Chessboard, settled: &Settled) -> Result<LensCalibration> {
+    let Settled { fitted, seen, is_turned, kept, rejected } = settled;
     let covariance = fitted.normal.covariance().ok_or_else(verdict::undetermined)?;
     let observations: usize =
         fitted.views.iter().map(|v| v.observations.iter().filter(|o| !o.is_outlier).count()).sum();
     let freedom = 2.0 * observations as f64 - fitted.normal.gradient.len() as f64;
     let variance = fitted.rms_px.powi(2) * observations as f64 / freedom.max(1.0);
     let sigma = std::array::from_fn(|k| (variance * covariance[(k, k)]).sqrt());
-    let views = images
+    let views = seen
         .iter()
         .enumerate()
         .map(|(v, image)| {
@@ -405,6 +396,7 @@ fn summarise(
                 pose,
                 rms_px: pose.map(|_| bundle.view_rms_px(0)).filter(|rms| rms.is_finite()),
                 rejected: rejected[v].clone(),
+                is_turned: is_turned[v],
                 residuals: view[0].observations.iter().filter_map(residual).collect(),
                 outliers: view[0].observations.iter().filter(|o| o.is_outlier).count(),
             }

@@ -1,7 +1,6 @@
 //! What is wrong with a calibration, in plain words, and what to photograph next.
 
 use super::lens::{Fitted, LensCalibration, LensStart};
-use super::turned::TurnedView;
 use crate::camera::chessboard::{BoardImage, Chessboard, median};
 use crate::error::{Error, Result};
 use crate::units::RawPx;
@@ -89,20 +88,17 @@ pub(super) fn is_bad(all_px: &[f64], rms_px: f64, ratio: f64, rms_px_min: f64) -
     rms_px > (ratio * median(all_px.to_vec())).max(rms_px_min)
 }
 
-pub(super) fn is_turned(turned: &TurnedView) -> String {
-    let [as_it_is, turned_back] = turned.rms_px;
-    format!(
-        "turned by 180 degrees against the others: error of {as_it_is:.2} px as it is, of {turned_back:.2} px turned back: use \
-         images as the camera delivers them, all of one mounting"
-    )
-}
-
-/// Where both kinds are about as telling, those kept may be the wrong ones.
-pub(super) fn turned_warning(count: usize) -> Option<String> {
-    (count > 0).then(|| {
+/// Of which kind there are more is the camera's way only if the technician says so.
+pub(super) fn turned_warning(is_turned: &[bool]) -> Option<String> {
+    let numbers: Vec<String> =
+        (1..).zip(is_turned).filter(|(_, t)| **t).map(|(n, _): (usize, _)| n.to_string()).collect();
+    (!numbers.is_empty()).then(|| {
         format!(
-            "{count} images seem to be turned by 180 degrees against the others, or the others against them: \
-             the principal point may be wrong. Use images as the camera delivers them, all of one mounting"
+            "{} images are turned by 180 degrees against the others and were turned back: view {}. If the \
+             camera delivers these and not the others, the principal point is mirrored: use images as it delivers \
+             them, all of one mounting",
+            numbers.len(),
+            numbers.join(", ")
         )
     })
 }

@@ -71,14 +71,17 @@ impl PatternTable {
     }
 }
 
+/// A mark in a frame: with its middle, and its turn.
+type Placed = (Mark, [f32; 2], [f32; 2]);
+
 /// The surface of a belt, in its own coordinates.
 pub(super) struct Surface {
     table: BeltTable,
     tile: Vec<f32>,
     /// Spots on the loop that comes again.
     dirt: Vec<Mark>,
-    /// Marks in view in this frame, each with its middle; by columns of the belt.
-    columns: Vec<Vec<(Mark, [f32; 2])>>,
+    /// Marks in view in this frame, by columns of the belt.
+    columns: Vec<Vec<Placed>>,
     /// How far tile and pattern have moved in this frame, and the belt to its side. Both repeat, so only
     /// the travel within one of them matters.
     tile_offset_mm: f32,
@@ -150,8 +153,9 @@ impl Surface {
             }
             let columns = Self::column(low as f32).zip(Self::column(high as f32));
             let middle = [x_mm as f32, (mark.y_mm + at.aside_mm) as f32];
+            let turn = mark.turn();
             for column in columns.map_or(0..0, |(low, high)| low..high + 1) {
-                self.columns[column].push((*mark, middle));
+                self.columns[column].push((*mark, middle, turn));
             }
         }
     }
@@ -168,8 +172,8 @@ impl Surface {
             return bare.max(0.0);
         }
         let marks = Self::column(x).and_then(|column| self.columns.get(column));
-        let marked = marks.into_iter().flatten().fold(bare, |grey, (mark, middle)| {
-            let share = mark.share([x - middle[0], y - middle[1]], px_mm);
+        let marked = marks.into_iter().flatten().fold(bare, |grey, (mark, middle, turn)| {
+            let share = mark.share(*turn, [x - middle[0], y - middle[1]], px_mm);
             grey + share * (mark.grey as f32 - grey)
         });
         marked.max(0.0)

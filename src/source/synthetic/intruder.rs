@@ -71,6 +71,31 @@ impl PlacedRod {
         Self { from: from + moved_mm, along: Vector3::from(rod.to_mm) - from, rod }
     }
 
+    /// Its ends.
+    pub(super) fn ends(&self) -> [Vector3<f64>; 2] {
+        [self.from, self.from + self.along]
+    }
+
+    pub(super) fn radius_mm(&self) -> f64 {
+        self.rod.radius_mm
+    }
+
+    /// Whether it is in the way from one point to another.
+    pub(super) fn hides(&self, from: [f32; 3], to: [f32; 3]) -> bool {
+        let [from, to] = [from, to].map(|p| Vector3::from(p.map(f64::from)));
+        let ray = to - from;
+        // The shortest way between the two stretches. Source: Ericson 2005, 5.1.9.
+        let between = from - self.from;
+        let (rr, aa, ra) = (ray.dot(&ray), self.along.dot(&self.along), ray.dot(&self.along));
+        let (rb, ab) = (ray.dot(&between), self.along.dot(&between));
+        let determinant = rr * aa - ra * ra;
+        let mut far = if determinant > 0.0 { (ra * ab - rb * aa) / determinant } else { 0.0 };
+        far = far.clamp(0.0, 1.0);
+        let share = ((ra * far + ab) / aa.max(f64::MIN_POSITIVE)).clamp(0.0, 1.0);
+        far = ((ra * share - rb) / rr.max(f64::MIN_POSITIVE)).clamp(0.0, 1.0);
+        (from + far * ray - self.from - share * self.along).norm() < self.rod.radius_mm
+    }
+
     /// How much of a pixel it covers on the ray from the camera, and the grey level there.
     pub(super) fn cover(
         &self,

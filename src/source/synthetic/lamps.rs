@@ -1,5 +1,6 @@
 //! Lamps, and the sun through a window: fall-off, glare, and shadows with penumbra.
 
+use super::intruder::PlacedRod;
 use super::solid::Solid;
 use serde::Deserialize;
 
@@ -62,6 +63,12 @@ impl Window {
 }
 
 impl Lamp {
+    /// A point that sees: what it sees in front of the belt is what its light would not reach.
+    pub(super) fn seen_from([x, y, z]: [f32; 3]) -> Self {
+        let [x_mm, y_mm, z_mm] = [x, y, z].map(f64::from);
+        Self { x_mm, y_mm, z_mm, radius_mm: 0.0, strength: 0.0, window: None }
+    }
+
     /// Whether it can be rendered.
     pub(super) fn is_usable(&self) -> bool {
         let window = self.window.is_none_or(|w| w.length_mm > 0.0 && w.width_mm > 0.0);
@@ -87,12 +94,10 @@ impl Lamp {
         [0, 1].map(|k| centre[k] + (at[k] - centre[k]) * throw)
     }
 
-    /// Point `k` of the disc. Source: Vogel 1979, the sunflower.
-    fn point(&self, k: usize) -> [f32; 3] {
-        const GOLDEN_RAD: f32 = 2.399_963_3;
-        let radius = self.radius_mm as f32 * ((k as f32 + 0.5) / POINTS as f32).sqrt();
-        let (sin, cos) = (k as f32 * GOLDEN_RAD).sin_cos();
-        [self.x_mm as f32 + radius * cos, self.y_mm as f32 + radius * sin, self.z_mm as f32]
+    /// A point of the disc, of those of the unit disc.
+    fn point(&self, [x, y]: [f32; 2]) -> [f32; 3] {
+        let radius = self.radius_mm as f32;
+        [self.x_mm as f32 + radius * x, self.y_mm as f32 + radius * y, self.z_mm as f32]
     }
 
     /// Grey levels that a glossy horizontal face at `at` throws into a camera at `camera`.
@@ -109,30 +114,123 @@ impl Lamp {
     }
 }
 
-/// Where on the belt the shadow of a solid from a lamp may lie.
-pub(super) struct Shadow {
+/// Points evenly over the unit disc, from the middle to the rim. Source: Vogel 1979, the sunflower.
+pub(super) struct Disc([[f32; 2]; POINTS]);
+
+impl Default for Disc {
+    fn default() -> Self {
+        const GOLDEN_RAD: f32 = 2.399_963_3;
+        Self(std::array::from_fn(|k| {
+            let radius = ((k as f32 + 0.5) / POINTS as f32).sqrt();
+            let (sin, cos) = (k as f32 * GOLDEN_RAD).sin_cos();
+            [radius * cos, radius * sin]
+        }))
+    }
+}
+
+/// What throws shadows in a frame.
+#[derive(Clone, Copy)]
+pub(super) struct Casters<'a> {
+    pub(super) solids: &'a [Solid],
+    pub(super) rods: &'a [PlacedRod],
+}
+
+impl Casters<'_> {
+    pub(super) fn count(&self) -> usize {
+        self.solids.len() + self.rods.len()
+    }
+}
+
+/// A place on a parcel: its solid, and its outward direction.
+#[derive(Clone, Copy)]
+pub(super) struct On {
     pub(super) solid: usize,
+    pub(super) normal: [f32; 3],
+}
+
+/// Where on the belt the shadow from a lamp may lie.
+pub(super) struct Shadow {
+    /// What throws it: solids first, then rods.
+    caster: usize,
     /// Smallest and largest x, then y.
     bounds: [f32; 4],
+    /// From light to light across its narrower side, half of both penumbrae included.
+    width_mm: f32,
 }
 
 impl Shadow {
-    pub(super) fn new(table: &Lamp, solid: usize, body: &Solid) -> Self {
-        let mut bounds = [f32::INFINITY, f32::NEG_INFINITY, f32::INFINITY, f32::NEG_INFINITY];
-        let height = table.z_mm as f32;
-        let throw = height / (height - body.height).max(1.0);
-        let radius = table.radius_mm as f32;
-        for corner in body.corners() {
-            for side in [-radius, radius] {
-                for (k, centre) in [table.x_mm, table.y_mm].into_iter().enumerate() {
-                    let from = centre as f32 + side;
-                    let at = from + (corner[k] - from) * throw;
-                    bounds[2 * k] = bounds[2 * k].min(at).min(corner[k]);
-                    bounds[2 * k + 1] = bounds[2 * k + 1].max(at).max(corner[k]);
-                }
+    /// Of a lamp; or, of a point without size, what is in front of the belt as seen from it.
+    pub(super) fn new(lamp: &Lamp, caster: usize, casters: Casters<'_>) -> Self {
+        let bounds = [f32::INFINITY, f32::NEG_INFINITY, f32::INFINITY, f32::NEG_INFINITY];
+        let mut shadow = Self { caster, bounds, width_mm: 0.0 };
+        if let Some(body) = casters.solids.get(caster) {
+            for corner in body.corners() {
+                shadow.hold(corner);
+                shadow.hold_thrown(lamp, [corner[0], corner[1], body.height]);
+            }
+            shadow.width_mm = 2.0 * body.half[1];
+            return shadow;
+        }
+        let rod = &casters.rods[caster - casters.solids.len()];
+        let radius = rod.radius_mm() as f32;
+        let z = rod.ends().map(|end| end.z as f32);
+        let throw = 1.0 / (lamp.z_mm as f32 - z[0].min(z[1])).max(1.0);
+        shadow.width_mm =
+            2.0 * (radius * lamp.z_mm as f32 + lamp.radius_mm as f32 * z[0].min(z[1])) * throw;
+        for end in rod.ends() {
+            for k in 0..8 {
+                let side = |bit: usize| if k >> bit & 1 == 1 { radius } else { -radius };
+                let corner = [0, 1, 2].map(|axis| end[axis] as f32 + side(axis));
+                shadow.hold_thrown(lamp, corner);
             }
         }
-        Self { solid, bounds }
+        shadow
+    }
+
+    fn hold(&mut self, at: [f32; 2]) {
+        for (k, at) in at.into_iter().enumerate() {
+            self.bounds[2 * k] = self.bounds[2 * k].min(at);
+            self.bounds[2 * k + 1] = self.bounds[2 * k + 1].max(at);
+        }
+    }
+
+    /// Where light from the rim of a lamp that passes a point meets the belt.
+    fn hold_thrown(&mut self, lamp: &Lamp, at: [f32; 3]) {
+        let height = lamp.z_mm as f32;
+        let throw = height / (height - at[2]).max(1.0);
+        let radius = lamp.radius_mm as f32;
+        for side in [-radius, radius] {
+            let from = [lamp.x_mm as f32 + side, lamp.y_mm as f32 + side];
+            self.hold([0, 1].map(|k| from[k] + (at[k] - from[k]) * throw));
+        }
+    }
+
+    /// Whether it may lie anywhere in a rectangle: smallest and largest x, then y.
+    pub(super) fn may_meet(&self, [x0, x1, y0, y1]: [f32; 4]) -> bool {
+        let [a0, a1, b0, b1] = self.bounds;
+        x1 >= a0 && x0 <= a1 && y1 >= b0 && y0 <= b1
+    }
+
+    /// Whether a square may lie in it without touching its border, or the other way round.
+    pub(super) fn is_narrower_than(&self, width_mm: f32) -> bool {
+        self.width_mm < width_mm
+    }
+
+    /// Whether what throws it is in the way from a point of the lamp.
+    fn hides(&self, from: [f32; 3], at: [f32; 3], on: Option<On>, casters: Casters<'_>) -> bool {
+        match casters.solids.get(self.caster) {
+            Some(solid) => match on.filter(|on| on.solid == self.caster) {
+                Some(on) => solid.hides_itself(from, at, on.normal),
+                None => solid.hides(from, at),
+            },
+            None => casters.rods[self.caster - casters.solids.len()].hides(from, at),
+        }
+    }
+
+    /// Whether it may hide light from what it is on: all but a parcel that is in its own light nowhere.
+    pub(super) fn may_fall_on(&self, on: Option<On>, casters: Casters<'_>) -> bool {
+        let own = on.filter(|on| on.solid == self.caster);
+        own.is_none_or(|on| casters.solids[on.solid].parcel.shape.shades_itself())
     }
 
     /// Whether light that meets the belt in a square may have been hidden.
@@ -154,16 +252,17 @@ impl Lamp {
     }
 }
 
-/// Share of a lamp's disc that solids hide from a point. `shadows`: those that may.
+/// Share of a lamp's disc that is hidden from a point. `shadows`: of what may be in the way.
 pub(super) fn hidden_share<'a>(
-    lamp: &Lamp,
+    (lamp, disc): (&Lamp, &Disc),
     at: [f32; 3],
+    on: Option<On>,
     shadows: &(impl Iterator<Item = &'a Shadow> + Clone),
-    solids: &[Solid],
+    casters: Casters<'_>,
 ) -> f32 {
     let hidden = |k: usize| {
-        let from = lamp.point(k);
-        shadows.clone().any(|s| solids[s.solid].hides(from, at))
+        let from = lamp.point(disc.0[k]);
+        shadows.clone().any(|shadow| shadow.hides(from, at, on, casters))
     };
     // Every fourth point, from the middle to the rim.
     let stride = POINTS / FIRST_POINTS;

@@ -1,6 +1,6 @@
 //! Light on the belt and on parcels: from everywhere, and by the lamps that nothing hides.
 
-use super::lamps::{LAMPS_MAX, Shadow, hidden_share};
+use super::lamps::{Casters, Disc, LAMPS_MAX, On, Shadow, hidden_share};
 use super::parcel::{Material, Parcel};
 use super::scenario::LightTable;
 use super::solid::{Hit, Solid};
@@ -17,12 +17,13 @@ pub(super) type Hidden = [f32; LAMPS_MAX];
 /// The light of a scenario, image after image.
 pub(super) struct Light {
     table: LightTable,
+    disc: Disc,
     /// By each lamp on the belt where no parcel is in the way, as a share of full brightness.
     on_belt: Vec<f32>,
     /// Grey levels that the lamps' images add to a belt that shines.
     shine: Vec<f32>,
     pixels: usize,
-    /// Where shadows may lie in this frame, lamp after lamp; room for those of all parcels.
+    /// Where shadows may lie in this frame, lamp after lamp; room for those of all that throws any.
     shadows: Vec<Shadow>,
 }
 
@@ -32,7 +33,7 @@ impl Light {
         camera: [f32; 3],
         ground: &[[f32; 2]],
         shine: f64,
-        parcels: usize,
+        casters: usize,
     ) -> Self {
         let lamps = &table.lamps;
         let on_belt = lamps.iter().flat_map(|lamp| {
@@ -45,8 +46,9 @@ impl Light {
             on_belt: on_belt.collect(),
             shine: if shine > 0.0 { ground.iter().map(mirrored).collect() } else { Vec::new() },
             pixels: ground.len(),
-            shadows: Vec::with_capacity(lamps.len() * parcels),
+            shadows: Vec::with_capacity(lamps.len() * casters),
             table: table.clone(),
+            disc: Disc::default(),
         }
     }
 
@@ -69,36 +71,57 @@ impl Light {
         self.table.ambient as f32 + by_lamps.sum::<f32>()
     }
 
-    /// Note where the shadows of this frame's solids may lie.
-    pub(super) fn place_shadows(&mut self, solids: &[Solid]) {
+    /// Note where the shadows of this frame may lie.
+    pub(super) fn place_shadows(&mut self, casters: Casters<'_>) {
         self.shadows.clear();
         for lamp in &self.table.lamps {
-            let of_lamp = solids.iter().enumerate().map(|(n, s)| Shadow::new(lamp, n, s));
+            let of_lamp = (0..casters.count()).map(|n| Shadow::new(lamp, n, casters));
             self.shadows.extend(of_lamp);
         }
     }
 
-    /// What solids hide of the lamps from a point, but for the solid that it is on.
-    pub(super) fn hidden(&self, at: [f32; 3], own: Option<usize>, solids: &[Solid]) -> Hidden {
+    /// Whether any shadow may lie in a rectangle of the belt, smallest and largest x, then y; and whether
+    /// one that is narrower than each of two widths.
+    pub(super) fn shadows_in(&self, rectangle: [f32; 4], widths_mm: [f32; 2]) -> (bool, [bool; 2]) {
+        let met = || self.shadows.iter().filter(|shadow| shadow.may_meet(rectangle));
+        let narrow = widths_mm.map(|width_mm| met().any(|s| s.is_narrower_than(width_mm)));
+        (met().next().is_some(), narrow)
+    }
+
+    /// What is hidden of the lamps from a point of a solid.
+    pub(super) fn hidden(&self, at: [f32; 3], on: On, casters: Casters<'_>) -> Hidden {
         let mut hidden = [0.0; LAMPS_MAX];
-        for (k, lamp) in self.table.lamps.iter().enumerate() {
-            let (middle, spread) = lamp.footprint(at);
-            let of_lamp = &self.shadows[k * solids.len()..][..solids.len()];
-            let near =
-                of_lamp.iter().filter(|s| Some(s.solid) != own && s.may_hold(middle, spread));
-            if near.clone().next().is_some() {
-                hidden[k] = hidden_share(lamp, at, &near, solids);
-            }
+        for (k, hidden) in hidden.iter_mut().enumerate().take(self.table.lamps.len()) {
+            *hidden = self.hidden_of(k, at, Some(on), casters);
         }
         hidden
     }
 
+    /// The same of one lamp, on the belt or on a solid.
+    fn hidden_of(&self, k: usize, at: [f32; 3], on: Option<On>, casters: Casters<'_>) -> f32 {
+        let (lamp, count) = (&self.table.lamps[k], casters.count());
+        let (middle, spread) = lamp.footprint(at);
+        let of_lamp = &self.shadows[k * count..][..count];
+        let near =
+            of_lamp.iter().filter(|s| s.may_hold(middle, spread) && s.may_fall_on(on, casters));
+        if near.clone().next().is_none() {
+            return 0.0;
+        }
+        hidden_share((lamp, &self.disc), at, on, &near, casters)
+    }
+
     /// What is left on the belt at pixel `i` of the light on the free belt.
-    pub(super) fn share_on_belt(&self, i: usize, [x, y]: [f32; 2], solids: &[Solid]) -> f32 {
-        let hidden = self.hidden([x, y, 0.0], None, solids);
-        let lost =
-            (0..self.table.lamps.len()).map(|k| hidden[k] * self.on_belt[k * self.pixels + i]);
-        let lost: f32 = lost.sum();
+    pub(super) fn share_on_belt(&self, i: usize, [x, y]: [f32; 2], casters: Casters<'_>) -> f32 {
+        let lost = |k: usize| {
+            let by_lamp = self.on_belt[k * self.pixels + i];
+            // Beside the patch that a window lets it reach there is nothing to hide.
+            if by_lamp > 0.0 {
+                by_lamp * self.hidden_of(k, [x, y, 0.0], None, casters)
+            } else {
+                0.0
+            }
+        };
+        let lost: f32 = (0..self.table.lamps.len()).map(lost).sum();
         if lost > 0.0 { (1.0 - lost / self.on_free_belt(i)).max(0.0) } else { 1.0 }
     }
 

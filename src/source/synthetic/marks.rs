@@ -64,9 +64,14 @@ impl Mark {
         0.5 * self.length_mm.hypot(self.width_mm) + self.edge_mm
     }
 
-    /// Share of the belt that it covers at a place from its middle.
-    pub(super) fn share(&self, [dx, dy]: [f32; 2], px_mm: f32) -> f32 {
+    /// Sine and cosine of its yaw.
+    pub(super) fn turn(&self) -> [f32; 2] {
         let (sin, cos) = (self.yaw_deg.to_radians() as f32).sin_cos();
+        [sin, cos]
+    }
+
+    /// Share of the belt that it covers at a place from its middle.
+    pub(super) fn share(&self, [sin, cos]: [f32; 2], [dx, dy]: [f32; 2], px_mm: f32) -> f32 {
         let (a, b) = (cos * dx + sin * dy, cos * dy - sin * dx);
         let half = [0.5 * self.length_mm as f32, 0.5 * self.width_mm as f32];
         let inside = if self.round {

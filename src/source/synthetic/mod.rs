@@ -4,6 +4,7 @@
 //! grey level; [`noise`] is a separate step. Serves demo, tests and benchmarks.
 
 mod belt;
+mod blocks;
 mod board;
 mod intruder;
 mod lamps;

@@ -53,6 +53,12 @@ pub struct Parcel {
     /// Broad tape along the middle of the top, brown on white and white on brown. Kraft always has some.
     #[serde(default)]
     pub tape: bool,
+    /// Radius of its edges; none given: the scenario's. Of boxes only.
+    pub edge_radius_mm: Option<f64>,
+    /// One corner of its top is pressed in, by so much along each of the three edges. Its sides stay what they
+    /// are.
+    #[serde(default)]
+    pub crush_mm: f64,
     /// How much further than the belt it goes, along and across travel, as a share of the way; nothing
     /// of it under the origin.
     #[serde(default)]
@@ -82,6 +88,8 @@ impl Parcel {
             && self.straps <= 4
             && (0.0..=1.0).contains(&self.wrap)
             && self.label_edge_mm.is_none_or(|mm| mm >= 0.0)
+            && self.edge_radius_mm.is_none_or(|mm| mm >= 0.0)
+            && (0.0..=0.5 * self.width_mm.min(self.height_mm)).contains(&self.crush_mm)
             && self.slide.iter().all(|share| share.abs() <= 0.2)
             && self.turn_deg_per_m.abs() <= 90.0
     }
@@ -102,6 +110,9 @@ impl Parcel {
 #[serde(deny_unknown_fields)]
 pub struct RandomTable {
     pub(super) count: usize,
+    /// After the last one the first comes again.
+    #[serde(default)]
+    pub(super) again: bool,
     /// Centre of the first one before the belt has moved.
     first_x_mm: f64,
     /// Free belt between neighbours, along travel.
@@ -145,6 +156,14 @@ impl RandomTable {
             end_mm -= half_mm;
         }
         parcels
+    }
+
+    /// How much belt they take, with a gap before the first comes again.
+    pub(super) fn loop_mm(&self, parcels: &[Parcel]) -> f64 {
+        let last_mm = parcels.last().map_or(self.first_x_mm, |parcel| parcel.x_mm);
+        // Half of the longest of both, whichever way they are turned.
+        let half_mm = 0.5 * self.length_mm[1].hypot(self.width_mm[1]);
+        self.first_x_mm - last_mm + 2.0 * half_mm + self.gap_mm[0]
     }
 }
 

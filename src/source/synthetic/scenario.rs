@@ -22,7 +22,8 @@ pub struct Scenario {
     pub seed: u64,
     /// Frames a second.
     pub fps: f64,
-    /// Length of the sequence.
+    /// Length of the sequence; not given: it goes on for ever.
+    #[serde(default = "without_end")]
     pub frames: u64,
     /// Shutter time.
     pub exposure_ms: f64,
@@ -47,9 +48,19 @@ pub struct Scenario {
     parcels: Vec<Parcel>,
     /// Parcels drawn at random, after those.
     random: Option<RandomTable>,
+    /// The same parcels come again after so much belt, if they do.
+    #[serde(skip)]
+    loop_mm: Option<f64>,
     /// What comes into the picture and does not ride.
     #[serde(default, rename = "intruder")]
     pub(super) intruders: Vec<Intruder>,
+}
+
+/// Further from the origin than this nobody sees a parcel: there it may be put back behind the others.
+const OUT_OF_SIGHT_MM: f64 = 5000.0;
+
+fn without_end() -> u64 {
+    u64::MAX
 }
 
 /// A carton's.
@@ -117,6 +128,8 @@ pub struct StopTable {
     /// Creeps back by so much while it stands.
     #[serde(default)]
     pub back_mm: f64,
+    /// Happens again after so much time, and again; not given: once.
+    pub every_s: Option<f64>,
 }
 
 /// `[light]`
@@ -220,7 +233,17 @@ impl Scenario {
                     .allowed(format!("up to {RANDOM_PARCELS_MAX} parcels")));
             }
             let mut generator = Random(scenario.seed);
-            scenario.parcels.extend(random.draw(&mut generator));
+            let parcels = random.draw(&mut generator);
+            if random.again {
+                let loop_mm = random.loop_mm(&parcels);
+                if loop_mm < 2.0 * OUT_OF_SIGHT_MM {
+                    return Err(Error::configuration("random.again: too few parcels").allowed(
+                        format!("parcels on {} mm of belt or more", 2.0 * OUT_OF_SIGHT_MM),
+                    ));
+                }
+                scenario.loop_mm = Some(loop_mm);
+            }
+            scenario.parcels.extend(parcels);
         }
         let height_max_mm = scenario.parcels.iter().map(|p| p.height_mm).fold(0.0, f64::max);
         if scenario.light.lamps.iter().any(|l| l.z_mm <= height_max_mm) {
@@ -259,7 +282,18 @@ impl Scenario {
     /// Where a parcel is in the middle of a frame's exposure.
     pub fn place_at_frame(&self, parcel: &Parcel, index: u64) -> Place {
         let t_s = index as f64 / self.fps;
-        parcel.place(self.travel_mm(t_s), self.aside_mm(t_s))
+        self.place(parcel, self.travel_mm(t_s), self.aside_mm(t_s))
+    }
+
+    /// Where a parcel is when the belt has moved so far, and has swung to the side so far. One that comes
+    /// again is put back behind the others once it is out of sight.
+    pub(super) fn place(&self, parcel: &Parcel, travel_mm: f64, aside_mm: f64) -> Place {
+        let rounds = self.loop_mm.map_or(0.0, |loop_mm| {
+            let beyond_mm = parcel.x_mm + travel_mm - OUT_OF_SIGHT_MM;
+            let rounds = (beyond_mm / loop_mm).floor() + 1.0;
+            rounds.max(0.0) * loop_mm
+        });
+        parcel.place(travel_mm - rounds, aside_mm)
     }
 
     /// Belt travel in the middle of a frame's exposure.
@@ -280,24 +314,38 @@ impl Scenario {
 
 impl StopTable {
     fn is_usable(&self) -> bool {
-        self.at_s >= 0.0 && self.for_s >= 0.0 && self.ramp_s > 0.0 && self.back_mm >= 0.0
+        self.at_s >= 0.0
+            && self.for_s >= 0.0
+            && self.ramp_s > 0.0
+            && self.back_mm >= 0.0
+            && self.every_s.is_none_or(|s| s >= 2.0 * self.ramp_s + self.for_s)
+    }
+
+    /// How often it is over at a time, and the time as it is for the one that is not.
+    fn round(&self, t_s: f64) -> (f64, f64) {
+        let every_s = self.every_s.unwrap_or(f64::INFINITY);
+        let rounds = ((t_s - self.at_s) / every_s).floor().max(0.0);
+        if rounds > 0.0 { (rounds, t_s - rounds * every_s) } else { (0.0, t_s) }
     }
 
     /// How far it has crept back until `t_s`: gently from standstill to standstill.
     fn gone_back_mm(&self, t_s: f64) -> f64 {
+        let (rounds, t_s) = self.round(t_s);
         let stands_s = t_s - self.at_s - self.ramp_s;
         let share = (stands_s / self.for_s.max(f64::MIN_POSITIVE)).clamp(0.0, 1.0);
-        self.back_mm * share * share * (3.0 - 2.0 * share)
+        self.back_mm * (rounds + share * share * (3.0 - 2.0 * share))
     }
 
     /// Running time lost to the stop until `t_s`: the integral of the missing speed.
     fn lost_s(&self, t_s: f64) -> f64 {
+        let (rounds, t_s) = self.round(t_s);
         let ramp = |since_s: f64| {
             let s = since_s.clamp(0.0, self.ramp_s);
             s * s / (2.0 * self.ramp_s) + (since_s - self.ramp_s).max(0.0)
         };
         // The speed that is missing rises in one ramp and falls again in the other.
-        ramp(t_s - self.at_s) - ramp(t_s - self.at_s - self.ramp_s - self.for_s)
+        let this_one = ramp(t_s - self.at_s) - ramp(t_s - self.at_s - self.ramp_s - self.for_s);
+        rounds * (self.for_s + self.ramp_s) + this_one
     }
 }
 
@@ -318,7 +366,7 @@ mod tests {
 
     #[test]
     fn a_stop_costs_its_standstill_and_one_ramp() {
-        let stop = StopTable { at_s: 2.0, for_s: 3.0, ramp_s: 0.5, back_mm: 12.0 };
+        let stop = StopTable { at_s: 2.0, for_s: 3.0, ramp_s: 0.5, back_mm: 12.0, every_s: None };
         assert!(stop.lost_s(2.0).abs() < 1e-12);
         assert!((stop.lost_s(100.0) - 3.5).abs() < 1e-12);
         // Standing still: all time is lost.
@@ -326,5 +374,38 @@ mod tests {
         // It creeps back while it stands, and only then.
         let gone = [2.5, 4.0, 5.5, 9.0].map(|t_s| stop.gone_back_mm(t_s));
         assert_eq!(gone.map(|mm| mm.round() as i32), [0, 6, 12, 12]);
+        let again = StopTable { every_s: Some(10.0), ..stop };
+        assert!((again.lost_s(100.0) - 10.0 * 3.5).abs() < 1e-9, "{}", again.lost_s(100.0));
+        assert!((again.gone_back_mm(100.0) - 120.0).abs() < 1e-9);
+        // Without a jump where one ends and the next begins.
+        let steps = (0..100_000).map(|k| again.lost_s(f64::from(k) * 1e-3));
+        let steps: Vec<f64> = steps.collect();
+        assert!(steps.windows(2).all(|w| (-1e-9..=1.001e-3).contains(&(w[1] - w[0]))));
+    }
+
+    #[test]
+    fn the_demo_never_runs_out_of_parcels_and_none_jumps_in_sight() {
+        let demo = include_str!("../../../config/demo/scenario.toml");
+        let scenario = Scenario::parse(demo).expect("committed");
+        let frames_a_day = (86_400.0 * scenario.fps) as u64;
+        let in_sight = |index: u64| {
+            let places = scenario.parcels().iter().map(|p| scenario.place_at_frame(p, index).x_mm);
+            places.filter(|x| x.abs() < 1000.0).count()
+        };
+        // At any time of any day, also where the first follows the last.
+        for index in (0..20_000).chain(frames_a_day..frames_a_day + 20_000).step_by(25).skip(4) {
+            let count = in_sight(index);
+            assert!((2..12).contains(&count), "{count} parcels in sight in frame {index}");
+        }
+        let frame_mm = scenario.belt.speed_mm_per_s / scenario.fps;
+        for parcel in scenario.parcels() {
+            for index in 0..20_000 {
+                let [before, after] =
+                    [index, index + 1].map(|n| scenario.place_at_frame(parcel, n).x_mm);
+                let moved_mm = after - before;
+                let jumped = !(-1e-6..=1.001 * frame_mm).contains(&moved_mm);
+                assert!(!jumped || before.min(after.abs()) > 4900.0, "{before} to {after}");
+            }
+        }
     }
 }

@@ -60,6 +60,9 @@ pub(super) struct Sensor {
     seed: u64,
     size_px: [usize; 2],
     scratch: Vec<u16>,
+    /// A row with its ends repeated, and the sums of one.
+    row: Vec<f32>,
+    sums: Vec<f32>,
     /// Grey out for light in, 1/256 grey levels both; empty when linear.
     curve: Vec<u16>,
     /// The frame that went out last, and its index.
@@ -77,6 +80,8 @@ impl Sensor {
         let moves = table.blur_px > 0.0 || table.vibration_px > 0.0;
         Self {
             scratch: vec![0; if moves { bytes } else { 0 }],
+            row: vec![0.0; size_px[0] + 2 * REACH],
+            sums: vec![0.0; size_px[0]],
             curve: if linear { Vec::new() } else { (0..65536).map(bent).collect() },
             before: vec![0; if table.denoise > 0.0 { bytes } else { 0 }],
             before_index: None,
@@ -110,20 +115,30 @@ impl Sensor {
         if !self.scratch.is_empty() {
             let mut random = Random(self.seed ^ 0x7669_6272 ^ index.wrapping_mul(0x9e37_79b9));
             let shift = [0; 2].map(|_| self.table.vibration_px * random.normal());
-            let rows = kernel(self.table.blur_px, shift[0]);
-            for (from, to) in clean.chunks(width).zip(self.scratch.chunks_mut(width)) {
-                for (u, to) in to.iter_mut().enumerate() {
-                    let at = |d: usize| from[(u + d).saturating_sub(REACH).min(width - 1)];
-                    *to = weighted(&rows, at);
-                }
-            }
-            let columns = kernel(self.table.blur_px, shift[1]);
             let height = self.size_px[1];
-            for (v, to) in clean.chunks_mut(width).enumerate() {
-                for (u, to) in to.iter_mut().enumerate() {
-                    let row = |d: usize| (v + d).saturating_sub(REACH).min(height - 1);
-                    *to = weighted(&columns, |d| self.scratch[row(d) * width + u]);
+            let rows = Kernel::new(self.table.blur_px, shift[0]);
+            for (from, to) in clean.chunks(width).zip(self.scratch.chunks_mut(width)) {
+                let row = &mut self.row[..width + 2 * REACH];
+                for (u, at) in row.iter_mut().enumerate() {
+                    *at = f32::from(from[u.saturating_sub(REACH).min(width - 1)]);
                 }
+                let sums = &mut self.sums[..width];
+                sums.fill(0.0);
+                for (d, weight) in rows.taps() {
+                    add(sums, weight, row[d..d + width].iter().copied());
+                }
+                round(sums, to);
+            }
+            let columns = Kernel::new(self.table.blur_px, shift[1]);
+            for (v, to) in clean.chunks_mut(width).enumerate() {
+                let sums = &mut self.sums[..width];
+                sums.fill(0.0);
+                for (d, weight) in columns.taps() {
+                    let row = (v + d).saturating_sub(REACH).min(height - 1);
+                    let from = &self.scratch[row * width..][..width];
+                    add(sums, weight, from.iter().map(|grey| f32::from(*grey)));
+                }
+                round(sums, to);
             }
         }
         if !self.curve.is_empty() {
@@ -154,27 +169,38 @@ impl Sensor {
 }
 
 /// Weights of a Gaussian at whole px around a shift; a blur of 0 is a linear interpolation.
-fn kernel(sigma_px: f64, shift_px: f64) -> [f32; 2 * REACH + 1] {
-    let weight = |k: usize| {
-        let far = k as f64 - REACH as f64 + shift_px;
-        if sigma_px > 0.0 {
-            (-0.5 * (far / sigma_px).powi(2)).exp()
-        } else {
-            (1.0 - far.abs()).max(0.0)
-        }
-    };
-    let sum: f64 = (0..=2 * REACH).map(weight).sum();
-    std::array::from_fn(|k| (weight(k) / sum) as f32)
+struct Kernel([f32; 2 * REACH + 1]);
+
+impl Kernel {
+    fn new(sigma_px: f64, shift_px: f64) -> Self {
+        let weight = |k: usize| {
+            let far = k as f64 - REACH as f64 + shift_px;
+            if sigma_px > 0.0 {
+                (-0.5 * (far / sigma_px).powi(2)).exp()
+            } else {
+                (1.0 - far.abs()).max(0.0)
+            }
+        };
+        let sum: f64 = (0..=2 * REACH).map(weight).sum();
+        Self(std::array::from_fn(|k| (weight(k) / sum) as f32))
+    }
+
+    /// Places and weights, but for those that are nothing.
+    fn taps(&self) -> impl Iterator<Item = (usize, f32)> + '_ {
+        self.0.iter().copied().enumerate().filter(|(_, weight)| *weight > 1e-4)
+    }
 }
 
-fn weighted(weights: &[f32; 2 * REACH + 1], at: impl Fn(usize) -> u16) -> u16 {
-    let sum: f32 = weights
-        .iter()
-        .enumerate()
-        .filter(|(_, w)| **w > 1e-4)
-        .map(|(d, w)| w * f32::from(at(d)))
-        .sum();
-    (sum + 0.5) as u16
+fn add(sums: &mut [f32], weight: f32, values: impl Iterator<Item = f32>) {
+    for (sum, value) in sums.iter_mut().zip(values) {
+        *sum += weight * value;
+    }
+}
+
+fn round(sums: &[f32], to: &mut [u16]) {
+    for (to, sum) in to.iter_mut().zip(sums) {
+        *to = (sum + 0.5) as u16;
+    }
 }
 
 /// Into a JPEG and back, in memory. A frame that does not make the way stays as it is.

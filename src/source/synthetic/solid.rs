@@ -105,16 +105,34 @@ impl Solid {
         })
     }
 
+    /// Whether its surface is that of its cuboid, but for rounded edges.
+    fn is_plain(&self) -> bool {
+        self.parcel.shape.is_box() && self.parcel.crush_mm == 0.0
+    }
+
     /// Whether it is in the way from a point above it to another.
     pub(super) fn hides(&self, from: [f32; 3], to: [f32; 3]) -> bool {
-        self.cross(from, to, 0.0)
-            .is_some_and(|ray| self.parcel.shape.is_box() || self.reaches(&ray))
+        self.cross(from, to, 0.0).is_some_and(|ray| {
+            let (shape, half, height) = (self.parcel.shape, self.half, self.height);
+            let of_cuboids =
+                || shape.is_met([ray.from, ray.along], [ray.enter, ray.leave], half, height);
+            let met = if self.parcel.crush_mm == 0.0 { of_cuboids() } else { None };
+            met.unwrap_or_else(|| self.reaches(&ray))
+        })
+    }
+
+    /// Whether it is in the way from a point above it to a point of its own surface.
+    pub(super) fn hides_itself(&self, from: [f32; 3], at: [f32; 3], normal: [f32; 3]) -> bool {
+        // Off the surface by more than the ray's last step, so that a face is not in its own way.
+        const OFF_MM: f32 = 3.0;
+        let off = [0, 1, 2].map(|k| at[k] + OFF_MM * normal[k]);
+        self.hides(from, off)
     }
 
     /// Where the camera's ray to a point of the belt meets the solid, as if its edges were sharp.
     pub(super) fn meet(&self, camera: [f32; 3], [x, y]: [f32; 2], shift_mm: f32) -> Option<Hit> {
         let ray = self.cross(camera, [x, y, 0.0], shift_mm)?;
-        if self.parcel.shape.is_box() { Some(self.sharp(&ray)) } else { self.march(&ray) }
+        if self.is_plain() { Some(self.sharp(&ray)) } else { self.march(&ray) }
     }
 
     fn sharp(&self, ray: &Crossing) -> Hit {
@@ -134,7 +152,7 @@ impl Solid {
         const NEAR_MM: f32 = 0.02;
         const STEPS: usize = 16;
         let ray = self.cross(camera, [x, y, 0.0], shift_mm)?;
-        if !self.parcel.shape.is_box() {
+        if !self.is_plain() {
             return self.march(&ray);
         }
         let [a, b, _] = ray.at(ray.enter);
@@ -146,15 +164,7 @@ impl Solid {
         let mut s = ray.enter;
         for _ in 0..STEPS {
             let p = ray.at(s);
-            // It goes on below the belt, so that its bottom edges are not rounded.
-            let core = [
-                p[0].abs() - (self.half[0] - self.radius),
-                p[1].abs() - (self.half[1] - self.radius),
-                p[2] - (self.height - self.radius),
-            ];
-            let outside = core.map(|c| c.max(0.0));
-            let distance = outside.iter().map(|c| c * c).sum::<f32>().sqrt() - self.radius
-                + core[0].max(core[1]).max(core[2]).min(0.0);
+            let (distance, outside) = self.rounded(p);
             if distance < NEAR_MM {
                 let normal = [outside[0].copysign(p[0]), outside[1].copysign(p[1]), outside[2]];
                 return Some(self.curved(p, normal));
@@ -167,14 +177,59 @@ impl Solid {
         None
     }
 
-    /// Whether a ray meets a solid of another shape, to a mm: shadows are no sharper.
+    /// Distance from the cuboid with rounded edges, and how far beyond its core along each axis. It goes
+    /// on below the belt, so that its bottom edges are not rounded.
+    fn rounded(&self, p: [f32; 3]) -> (f32, [f32; 3]) {
+        let core = [
+            p[0].abs() - (self.half[0] - self.radius),
+            p[1].abs() - (self.half[1] - self.radius),
+            p[2] - (self.height - self.radius),
+        ];
+        let outside = core.map(|c| c.max(0.0));
+        let distance = outside.iter().map(|c| c * c).sum::<f32>().sqrt() - self.radius
+            + core[0].max(core[1]).max(core[2]).min(0.0);
+        (distance, outside)
+    }
+
+    /// A bound on the distance of a point from its surface.
+    fn distance(&self, p: [f32; 3]) -> f32 {
+        let shape = self.parcel.shape;
+        let whole = if shape.is_box() {
+            self.rounded(p).0
+        } else {
+            shape.distance(p, self.half, self.height)
+        };
+        if self.parcel.crush_mm == 0.0 {
+            return whole;
+        }
+        // A plane cuts the pressed corner off.
+        let corner = self.half[0] + self.half[1] + self.height - self.parcel.crush_mm as f32;
+        whole.max((p[0] + p[1] + p[2] - corner) / 3.0f32.sqrt())
+    }
+
+    /// Direction away from its surface near a point of it, of length 1.
+    fn normal(&self, at: [f32; 3]) -> [f32; 3] {
+        const STEP_MM: f32 = 0.1;
+        let slope = [0, 1, 2].map(|k| {
+            let moved = |by: f32| {
+                let mut at = at;
+                at[k] += by;
+                self.distance(at)
+            };
+            moved(STEP_MM) - moved(-STEP_MM)
+        });
+        let length = slope.iter().map(|s| s * s).sum::<f32>().sqrt().max(f32::MIN_POSITIVE);
+        slope.map(|s| s / length)
+    }
+
+    /// Whether a ray meets what is no plain cuboid, to a mm: shadows are no sharper.
     fn reaches(&self, ray: &Crossing) -> bool {
         const NEAR_MM: f32 = 1.0;
         const STEPS: usize = 24;
         let length = ray.along.iter().map(|a| a * a).sum::<f32>().sqrt();
         let mut s = ray.enter;
         for _ in 0..STEPS {
-            let distance = self.parcel.shape.distance(ray.at(s), self.half, self.height);
+            let distance = self.distance(ray.at(s));
             if distance < NEAR_MM {
                 return true;
             }
@@ -186,7 +241,7 @@ impl Solid {
         false
     }
 
-    /// Where a ray meets a solid of another shape: sphere tracing through its cuboid.
+    /// Where a ray meets what is no plain cuboid: sphere tracing through its cuboid.
     fn march(&self, ray: &Crossing) -> Option<Hit> {
         const NEAR_MM: f32 = 0.05;
         const STEPS: usize = 96;
@@ -195,9 +250,9 @@ impl Solid {
         let mut s = ray.enter;
         for _ in 0..STEPS {
             let at = ray.at(s);
-            let distance = shape.distance(at, self.half, self.height);
+            let distance = self.distance(at);
             if distance < NEAR_MM {
-                let mut hit = self.curved(at, shape.normal(at, self.half, self.height));
+                let mut hit = self.curved(at, self.normal(at));
                 let open = shape.openness(at, self.half, self.height);
                 if open < 1.0 {
                     hit.surface.id += INSIDE;

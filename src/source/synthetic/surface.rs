@@ -28,6 +28,14 @@ pub(super) struct Surface {
     pub(super) grey: f32,
 }
 
+/// What a surface lies on: whatever is stuck or printed on the top is the top.
+pub(super) fn face(id: u8) -> u8 {
+    match id {
+        LABEL | BAR | TAPE | PRINT..INSIDE => TOP,
+        other => other,
+    }
+}
+
 /// Grey level of the bare surface in full light.
 fn plain_grey(material: Material) -> f32 {
     match material {

@@ -115,6 +115,45 @@ fn a_tall_parcel_throws_its_shadow_on_its_flat_neighbour() {
 }
 
 #[test]
+fn what_hangs_in_throws_its_shadow_on_belt_and_parcel() {
+    // The lamp is at x = -700, z = 1600: light that passes z = 700 at x = -263 meets z = 10 at x = 75.
+    let rod = "[[intruder]]\nfrom_s = 0\nto_s = 9\nvelocity_mm_per_s = [0, 0, 0]\n\
+               rod = [{ from_mm = [-263, -300, 700], to_mm = [-263, 300, 700], radius_mm = 15, grey = 20 }]";
+    let (mut free, mut hung) = (small(&[]), small(&[("#FLAT", rod)]));
+    let (without, with) = (rendered(&mut free, 0), rendered(&mut hung, 0));
+    for at in [[75.0, 60.0, 10.0], [82.0, 150.0, 0.0]] {
+        let (lit, dark) = (grey_at(&free, &without, at), grey_at(&free, &with, at));
+        assert!(dark < 0.6 * lit, "{at:?}: {dark} of {lit}");
+    }
+    let beside = [140.0, 150.0, 0.0];
+    assert_eq!(grey_at(&free, &without, beside).to_bits(), grey_at(&free, &with, beside).to_bits());
+}
+
+#[test]
+fn a_tote_is_in_its_own_light_and_a_box_is_not() {
+    // Lit from -X: inside, the wall there throws its shadow on the floor; the other wall is lit.
+    let mut tote = small(&[("#TALL", "shape = \"tote\""), ("ambient = 0.3", "ambient = 0.05")]);
+    let frame = rendered(&mut tote, 12);
+    let floor = grey_at(&tote, &frame, [-30.0, 0.0, 4.0]);
+    let wall = grey_at(&tote, &frame, [54.0, 0.0, 140.0]);
+    assert!(floor < 0.3 * wall, "floor {floor}, wall {wall}");
+}
+
+#[test]
+fn a_long_exposure_smears_the_belt_along_its_way_only() {
+    let lines = "pattern = { kind = \"ribbed\", pitch_mm = 30, contrast_grey = 40, gap_mm = 8 }";
+    let contrast = |exposure: &str| {
+        let mut belt = small(&[("#BELT", lines), ("exposure_ms = 1.0", exposure)]);
+        let frame = rendered(&mut belt, 0);
+        let row: Vec<u8> = frame[180 * 320 + 200..180 * 320 + 300].to_vec();
+        row.iter().max().copied().unwrap_or(0) - row.iter().min().copied().unwrap_or(0)
+    };
+    // 15 mm of way: half a pitch; the groove is a quarter of it.
+    let (sharp, smeared) = (contrast("exposure_ms = 1.0"), contrast("exposure_ms = 30"));
+    assert!(f64::from(smeared) < 0.75 * f64::from(sharp), "{smeared} of {sharp}");
+}
+
+#[test]
 fn the_sun_through_a_window_lights_a_patch_and_no_more() {
     let sun = "[[light.lamp]]\nx_mm = 0\ny_mm = 0\nz_mm = 100000\nradius_mm = 470\nstrength = 1\n\
                window = { x_mm = 250, y_mm = -150, length_mm = 100, width_mm = 80, yaw_deg = 0, edge_mm = 5 }";
@@ -139,6 +178,8 @@ fn every_property_can_be_said_and_shows() {
         ("#TALL", "wrap = 0.8"),
         ("#TALL", "label_edge_mm = 2"),
         ("#TALL", "tape = true"),
+        ("#TALL", "crush_mm = 40"),
+        ("#TALL", "edge_radius_mm = 40"),
         ("#TALL", "slide = [0.02, 0.02]"),
         ("#TALL", "turn_deg_per_m = 20"),
         ("#BELT", "side_drift_mm = 8"),

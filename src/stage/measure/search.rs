@@ -56,27 +56,6 @@ impl Search {
     /// Nothing tried.
     pub const NEW: Self = Self { round: 0, candidates: None, found: [None; 2] };
 
-    /// The best start near a known one, no face further inside than `inside_max_mm`: each face's edge
-    /// as it is or as the votes place it, top or base.
-    pub fn from(
-        problem: &Problem<'_>,
-        views: &[PassView],
-        start: Params,
-        inside_max_mm: f64,
-    ) -> Option<Estimate> {
-        let votes = problem.face_votes(views, &start, inside_max_mm);
-        let mut candidates = Candidates::new(start, votes);
-        let mut best: Option<Estimate> = None;
-        while candidates.left > 0 {
-            let start = candidates.take(problem);
-            let Some(found) = problem.refine_edges(views, start, &GATES_PX) else { continue };
-            if best.is_none_or(|best| found.score() > best.score()) {
-                best = Some(found);
-            }
-        }
-        best
-    }
-
     /// The best start with corners.
     pub fn with_corners(&self) -> Option<Found> {
         self.found[0]
@@ -109,7 +88,7 @@ impl Search {
         let Some(candidates) = &mut self.candidates else {
             if let Some(reach) = problem.fit_reach(views, None) {
                 let start = named_like(reach.params, &running.unwrap_or(reach.params));
-                let votes = problem.face_votes(views, &start, f64::INFINITY);
+                let votes = problem.face_votes(views, &start);
                 self.candidates = Some(Candidates::new(start, votes));
                 self.offer(Found { silhouette, estimate: Estimate { params: start, ..reach } });
             } else {

@@ -33,14 +33,8 @@ pub struct FaceVote {
 }
 
 impl Problem<'_> {
-    /// Where most profiles of the whole pass agree on an edge at each face. `inside_max_mm`: no edge is
-    /// further inside of the cuboid than that.
-    pub(super) fn face_votes(
-        &self,
-        views: &[PassView],
-        params: &Params,
-        inside_max_mm: f64,
-    ) -> [FaceVote; 4] {
+    /// Where most profiles of the whole pass agree on an edge at each face.
+    pub(super) fn face_votes(&self, views: &[PassView], params: &Params) -> [FaceVote; 4] {
         let mut votes = [[[0.0f64; VOTE_BINS]; 2]; 4];
         let mut depth = [(0.0, 0u32); 4];
         let mut sampled = 0;
@@ -76,7 +70,7 @@ impl Problem<'_> {
                 2 * count > sampled && mean > SIDE_DEPTH_MIN_PX * self.geometry.mm_per_px;
             // An edge further inside than this is the other side's, or a stripe's.
             let extent_mm = params[if k % 2 == 0 { LENGTH } else { WIDTH }];
-            let inside_mm = (INSIDE_MAX * extent_mm).min(inside_max_mm);
+            let inside_mm = INSIDE_MAX * extent_mm;
             let inside_px = m * inside_mm / self.geometry.mm_per_px;
             FaceVote {
                 offset_mm: outermost_peak(&votes[k], -inside_px)

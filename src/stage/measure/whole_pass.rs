@@ -4,17 +4,18 @@ use super::corners::TopMotion;
 use super::fit::{Estimate, GATES_PX, Problem, Silhouette};
 use super::model::{HEIGHT, LENGTH, Outline, Params, Rounding, SCALE, WIDTH, X, Y, YAW};
 use super::observe::{Frame, PassView};
-use super::search::Search;
 use super::{BOX_EDGE_SHARE_MIN, EDGE_COUNT_MIN, Measured};
 use crate::camera::BeltView;
-use crate::stage::parcels::Face;
+use crate::stage::parcels::{Face, Rectangle};
 use crate::stage::views::Views;
 use crate::units::BeltRect;
 
 /// A face's height from the evidence is good to this, mm.
-const FACE_HEIGHT_SIGMA_MM: f64 = 1.5;
-/// A face's border is known to this, mm: a line further inside is a label's.
-const FACE_BORDER_MM: f64 = 10.0;
+const FACE_HEIGHT_SIGMA_MM: f64 = 6.0;
+/// A border further inside must explain this share of the edges more.
+const CLEARLY_BETTER: f64 = 0.03;
+/// Lower than this is the belt, mm.
+const HEIGHT_MIN_MM: f64 = 2.4;
 /// Narrower than this is no parcel, mm.
 const LINE_MM: f64 = 6.0;
 /// Times that the profiles are taken anew, where the last fit has the edges.
@@ -35,18 +36,29 @@ pub struct WholePass<'a> {
 }
 
 impl WholePass<'_> {
-    /// Fit a cuboid to the views of a face's pass; X holds at the newest view's belt position.
+    /// Fit a cuboid to the views of a face's pass; X holds at the newest view's belt position. Of the
+    /// borders that may be the face's, that one which most edges confirm.
     pub fn fit(&self, views: &Views, face: &Face) -> Option<Measured> {
+        let narrower = face.narrower.iter().flatten();
+        let borders = std::iter::once(&face.rectangle).chain(narrower);
+        let fits = borders.filter_map(|border| self.fit_border(views, border, face.height_mm));
+        fits.reduce(|outer, inner| {
+            let better = inner.estimate.edge_share > outer.estimate.edge_share + CLEARLY_BETTER;
+            if better { inner } else { outer }
+        })
+    }
+
+    fn fit_border(&self, views: &Views, border: &Rectangle, height_mm: f64) -> Option<Measured> {
         let newest = views.kept(views.newest()?).at;
         let mut params = Params::zeros();
-        params[X] = face.x_less_travel_mm + newest.travel_mm;
-        params[Y] = face.y_mm;
-        params[YAW] = face.yaw;
-        params[LENGTH] = face.length_mm;
-        params[WIDTH] = face.width_mm;
-        params[HEIGHT] = face.height_mm;
+        params[X] = border.x_mm + newest.travel_mm;
+        params[Y] = border.y_mm;
+        params[YAW] = border.yaw;
+        params[LENGTH] = border.length_mm;
+        params[WIDTH] = border.width_mm;
+        params[HEIGHT] = height_mm;
         params[SCALE] = 1.0;
-        let m = self.geometry.magnification(face.height_mm);
+        let m = self.geometry.magnification(height_mm);
         let sigma = m * m / self.geometry.camera_height_mm * FACE_HEIGHT_SIGMA_MM;
         let problem = Problem {
             geometry: self.geometry,
@@ -64,8 +76,7 @@ impl WholePass<'_> {
         for round in 0..ROUNDS {
             let pass = self.look(views, &params, newest.travel_mm);
             let fitted = if round == 0 {
-                Search::from(&problem.on_some_of(&pass), &pass, params, FACE_BORDER_MM)
-                    .and_then(|found| problem.refine_edges(&pass, found.params, &GATES_PX))
+                problem.refine_edges(&pass, params, &GATES_PX)
             } else {
                 problem.fit_edges(&pass, params)
             };
@@ -74,6 +85,10 @@ impl WholePass<'_> {
             best = Some(fitted);
         }
         let estimate = best?;
+        // What lies on the belt itself, its texture or a label stuck to it, is no parcel.
+        if estimate.params[HEIGHT] < HEIGHT_MIN_MM {
+            return None;
+        }
         // What has shrunk to a line was one: the border of a shadow, a seam.
         if estimate.params[LENGTH].min(estimate.params[WIDTH]) < LINE_MM {
             return None;

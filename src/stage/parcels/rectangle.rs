@@ -1,0 +1,472 @@
+//! The rectangle whose four sides the edge pixels of a plane explain best.
+//!
+//! In: the edge pixels of a stack, and a point that must lie inside. Out: the rectangle of the largest score:
+//! what of its sides is edge, less what is not. So the outermost rectangle with whole sides wins over
+//! every label and print inside it, and a line further out that the other sides do not reach (a shadow, a
+//! neighbour) costs more than it brings. Tried is every combination of the most promising lines, for
+//! the directions that most edges have.
+
+use super::stack::Stack;
+use crate::camera::BeltView;
+use crate::error::Result;
+use crate::plan::{Block, Memory, Plan};
+use crate::units::BeltRect;
+
+/// Directions tried: so many peaks of the edges' directions, ...
+const DIRECTIONS: usize = 4;
+/// ... each turned by this, degrees, ...
+const TURNS_DEG: [f32; 5] = [-1.5, -0.75, 0.0, 0.75, 1.5];
+/// ... and the best by this once more.
+const FINE_TURNS_DEG: [f32; 4] = [-0.5, -0.25, 0.25, 0.5];
+/// Around a known direction it is turned by this.
+const NEAR_TURNS_DEG: [f32; 3] = [-0.4, 0.0, 0.4];
+/// Peaks of direction are this far apart, half degrees.
+const DIRECTIONS_APART: usize = 8;
+/// Edges count for the direction with this distance from the middle, mm.
+const DIRECTION_REACH_MM: f32 = 150.0;
+/// Bins of the direction within a quarter turn: half degrees.
+const BINS: usize = 180;
+/// A side's edges point across it: within 15 degrees.
+const ACROSS_MIN: f32 = 0.966;
+/// Lines tried on each of the four sides.
+const LINES: usize = 12;
+/// A line's longest stretch is at least this, px.
+const STRETCH_MIN_PX: i32 = 5;
+/// A line this far inside of a side is another one, mm, ...
+const APART_MM: f64 = 6.0;
+/// ... and the side's rival up to this share of the rectangle, ...
+const NARROWER_SHARE: f64 = 0.4;
+/// ... if it is edge for this share of what the side is.
+const NEARLY: f64 = 0.75;
+/// Sides shorter than this are no parcel, mm.
+const SIDE_MIN_MM: f64 = 12.0;
+
+/// A rectangle on a plane, belt-fixed.
+#[derive(Clone, Copy, Debug, Default, PartialEq)]
+pub struct Rectangle {
+    /// Middle: X less the belt's travel, mm.
+    pub x_mm: f64,
+    /// Middle across the belt, mm.
+    pub y_mm: f64,
+    /// Direction of the length against +X, radians.
+    pub yaw: f64,
+    /// Along the yaw, mm.
+    pub length_mm: f64,
+    /// Across it, mm.
+    pub width_mm: f64,
+    /// Edge along the sides less what is none, mm.
+    pub score_mm: f64,
+    /// Share of each side that is edge: front, back, left, right seen along the yaw.
+    pub sides: [f64; 4],
+}
+
+impl Rectangle {
+    /// Position along and across the rectangle, from its middle, mm.
+    pub fn along_across(&self, x_mm: f64, y_mm: f64) -> (f64, f64) {
+        let (sin, cos) = self.yaw.sin_cos();
+        let (dx, dy) = (x_mm - self.x_mm, y_mm - self.y_mm);
+        (cos * dx + sin * dy, cos * dy - sin * dx)
+    }
+
+    /// How far a point is outside, mm; negative inside.
+    pub fn outside_mm(&self, x_mm: f64, y_mm: f64) -> f64 {
+        let (along, across) = self.along_across(x_mm, y_mm);
+        (along.abs() - 0.5 * self.length_mm).max(across.abs() - 0.5 * self.width_mm)
+    }
+
+    /// The lowest X less travel that it reaches: its trailing end.
+    pub fn trailing_mm(&self) -> f64 {
+        self.x_mm - self.reach_mm()
+    }
+
+    /// Half of its extent along travel.
+    pub fn reach_mm(&self) -> f64 {
+        let (sin, cos) = self.yaw.sin_cos();
+        0.5 * (self.length_mm * cos.abs() + self.width_mm * sin.abs())
+    }
+
+    /// Share of this rectangle that lies inside another, by a grid of points.
+    pub fn share_inside(&self, other: &Self) -> f64 {
+        const POINTS: usize = 9;
+        let (sin, cos) = self.yaw.sin_cos();
+        let at = |i: usize| (i as f64 + 0.5) / POINTS as f64 - 0.5;
+        let inside = (0..POINTS * POINTS).filter(|i| {
+            let (along, across) = (at(i / POINTS) * self.length_mm, at(i % POINTS) * self.width_mm);
+            let x_mm = self.x_mm + cos * along - sin * across;
+            let y_mm = self.y_mm + sin * along + cos * across;
+            other.outside_mm(x_mm, y_mm) < 0.0
+        });
+        inside.count() as f64 / (POINTS * POINTS) as f64
+    }
+
+    /// Share of its border that is edge.
+    pub fn support(&self) -> f64 {
+        let [front, back, left, right] = self.sides;
+        let (length, width) = (self.length_mm, self.width_mm);
+        ((front + back) * width + (left + right) * length) / (2.0 * (length + width))
+    }
+}
+
+/// The search.
+pub struct RectangleSearch {
+    /// Edge pixels in the turned grid whose step is along u, and along v: 0 none, [`WHOLE`] all views agree;
+    /// [`UNSEEN`].
+    grid: Block<[u8; 2]>,
+    /// Sums down the columns and along the rows: from [`WHOLE`] for an edge to -[`WHOLE`] for none.
+    down: Block<i32>,
+    along: Block<i32>,
+}
+
+/// What no view sees, or only beside a thing that stands still, tells nothing.
+const UNSEEN: u8 = u8::MAX;
+
+/// The grid of one direction: u along the yaw, v to its left.
+struct Turned {
+    sin: f32,
+    cos: f32,
+    origin: [f32; 2],
+    columns: usize,
+    rows: usize,
+    px_mm: f32,
+}
+
+impl Turned {
+    fn cell(&self, x_mm: f32, y_mm: f32) -> (usize, usize) {
+        let u = (self.cos * x_mm + self.sin * y_mm - self.origin[0]) / self.px_mm;
+        let v = (self.cos * y_mm - self.sin * x_mm - self.origin[1]) / self.px_mm;
+        (u.round().max(0.0) as usize, v.round().max(0.0) as usize)
+    }
+
+    fn point(&self, column: f32, row: f32) -> (f32, f32) {
+        let (u, v) = (self.origin[0] + column * self.px_mm, self.origin[1] + row * self.px_mm);
+        (self.cos * u - self.sin * v, self.sin * u + self.cos * v)
+    }
+}
+
+/// An edge pixel on which all views agree.
+const WHOLE: u8 = 8;
+
+impl RectangleSearch {
+    /// Memory for the largest window turned by 45 degrees.
+    pub fn plan(view: &BeltView, zone: &BeltRect, plan: &mut Plan) {
+        let n = Self::cells_max(view, zone);
+        plan.add::<[u8; 2]>("rectangle.grid", n, "edge pixels along a direction");
+        plan.add::<i32>("rectangle.down", n, "their sums down the columns");
+        plan.add::<i32>("rectangle.along", n, "their sums along the rows");
+    }
+
+    fn cells_max(view: &BeltView, zone: &BeltRect) -> usize {
+        let (columns, rows) = Stack::sides_max_px(view, zone);
+        let side = columns + rows + 2 * usize::from(MARGIN);
+        side * side / 2 + 2 * side
+    }
+
+    /// Nothing searched.
+    pub fn new(memory: &mut Memory) -> Result<Self> {
+        Ok(Self {
+            grid: memory.take("rectangle.grid", [0; 2])?,
+            down: memory.take("rectangle.down", 0)?,
+            along: memory.take("rectangle.along", 0)?,
+        })
+    }
+
+    /// The best rectangle around a point (X less travel, Y, mm).
+    pub fn best(&mut self, stack: &Stack, inside_mm: [f32; 2]) -> Option<Rectangle> {
+        let mut best: Option<Rectangle> = None;
+        let mut offer = |found: Option<Rectangle>| {
+            if let Some(found) = found
+                && best.is_none_or(|best| found.score_mm > best.score_mm)
+            {
+                best = Some(found);
+            }
+            best
+        };
+        for direction in directions(stack, inside_mm).into_iter().flatten() {
+            for turn in TURNS_DEG {
+                offer(self.best_at(stack, inside_mm, direction + turn.to_radians()));
+            }
+        }
+        let coarse = offer(None)?;
+        for turn in FINE_TURNS_DEG {
+            offer(self.best_at(stack, inside_mm, coarse.yaw as f32 + turn.to_radians()));
+        }
+        best
+    }
+
+    /// The best rectangle around a point whose direction is known to a degree.
+    pub fn near(&mut self, stack: &Stack, inside_mm: [f32; 2], yaw: f32) -> Option<Rectangle> {
+        let mut best: Option<Rectangle> = None;
+        for turn in NEAR_TURNS_DEG {
+            let found = self.best_at(stack, inside_mm, yaw + turn.to_radians());
+            if let Some(found) = found
+                && best.is_none_or(|best| found.score_mm > best.score_mm)
+            {
+                best = Some(found);
+            }
+        }
+        best
+    }
+
+    fn best_at(&mut self, stack: &Stack, inside_mm: [f32; 2], yaw: f32) -> Option<Rectangle> {
+        let turned = self.turn(stack, yaw)?;
+        self.sum_up(&turned);
+        let (columns, rows) = (turned.columns, turned.rows);
+        let (column, row) = turned.cell(inside_mm[0], inside_mm[1]);
+        let (mut left, mut right) = ([0usize; LINES], [0usize; LINES]);
+        let (mut low, mut high) = ([0usize; LINES], [0usize; LINES]);
+        let down = |c: usize, r: usize| self.down[r * columns + c];
+        let along = |c: usize, r: usize| self.along[r * columns + c];
+        let stretch_down = |c: usize| longest_stretch((0..rows).map(|r| down(c, r)));
+        let stretch_along = |r: usize| longest_stretch((0..columns).map(|c| along(c, r)));
+        let lefts = lines(0..column.min(columns), stretch_down, &mut left);
+        let rights = lines(column + 1..columns, stretch_down, &mut right);
+        let lows = lines(0..row.min(rows), stretch_along, &mut low);
+        let highs = lines(row + 1..rows, stretch_along, &mut high);
+        let side_min_px = (SIDE_MIN_MM / f64::from(turned.px_mm)) as usize;
+        let mut best: Option<(i32, [usize; 4])> = None;
+        for &l in lefts {
+            for &r in rights {
+                if r - l < side_min_px {
+                    continue;
+                }
+                for &b in lows {
+                    let base = along(r, b) - along(l, b);
+                    for &t in highs {
+                        if t - b < side_min_px {
+                            continue;
+                        }
+                        let score = base + along(r, t) - along(l, t) + down(l, t) - down(l, b)
+                            + down(r, t)
+                            - down(r, b);
+                        if best.is_none_or(|(most, _)| score > most) {
+                            best = Some((score, [l, r, b, t]));
+                        }
+                    }
+                }
+            }
+        }
+        let (score, [l, r, b, t]) = best.filter(|(score, _)| *score > 0)?;
+        Some(self.rectangle(&turned, yaw, score, [l, r, b, t]))
+    }
+
+    fn rectangle(
+        &self,
+        turned: &Turned,
+        yaw: f32,
+        score: i32,
+        [l, r, b, t]: [usize; 4],
+    ) -> Rectangle {
+        let (x, y) = turned.point(0.5 * (l + r) as f32, 0.5 * (b + t) as f32);
+        let px_mm = f64::from(turned.px_mm);
+        let cell = |column: usize, row: usize| self.grid[row * turned.columns + column];
+        Rectangle {
+            x_mm: f64::from(x),
+            y_mm: f64::from(y),
+            yaw: f64::from(yaw),
+            length_mm: (r - l) as f64 * px_mm,
+            width_mm: (t - b) as f64 * px_mm,
+            score_mm: f64::from(score) * px_mm / f64::from(WHOLE),
+            sides: [
+                share((b + 1..=t).map(|row| cell(r, row)[0])),
+                share((b + 1..=t).map(|row| cell(l, row)[0])),
+                share((l + 1..=r).map(|column| cell(column, t)[1])),
+                share((l + 1..=r).map(|column| cell(column, b)[1])),
+            ],
+        }
+    }
+
+    /// For each side the best rectangle whose side is further inside, if it is nearly as well explained:
+    /// of two lines one may be a shadow's, and the fit must tell.
+    pub fn narrower(&mut self, stack: &Stack, outer: &Rectangle) -> [Option<Rectangle>; 4] {
+        let yaw = outer.yaw as f32;
+        let Some(turned) = self.turn(stack, yaw) else { return [None; 4] };
+        self.sum_up(&turned);
+        let px_mm = f64::from(turned.px_mm);
+        let (column, row) = turned.cell(outer.x_mm as f32, outer.y_mm as f32);
+        let half = |length_mm: f64| (0.5 * length_mm / px_mm).round() as usize;
+        let (du, dv) = (half(outer.length_mm), half(outer.width_mm));
+        if column < du || row < dv || column + du >= turned.columns || row + dv >= turned.rows {
+            return [None; 4];
+        }
+        let whole = [column - du, column + du, row - dv, row + dv];
+        let least_px = (APART_MM / px_mm).ceil() as usize;
+        std::array::from_fn(|side| {
+            let most_px = (NARROWER_SHARE * 2.0 * [du, dv][side / 2] as f64) as usize;
+            let rectangles = (least_px..=most_px).map(|by| {
+                let mut lines = whole;
+                if side % 2 == 0 {
+                    lines[side] += by;
+                } else {
+                    lines[side] -= by;
+                }
+                self.rectangle(&turned, yaw, 0, lines)
+            });
+            let best = rectangles.max_by(|a, b| a.support().total_cmp(&b.support()))?;
+            let which = [1, 0, 3, 2][side];
+            (best.sides[which] > NEARLY * outer.sides[which]).then_some(best)
+        })
+    }
+
+    /// The edge pixels in a grid turned by `yaw`, each as wide as two pixels across its side.
+    fn turn(&mut self, stack: &Stack, yaw: f32) -> Option<Turned> {
+        let (sin, cos) = yaw.sin_cos();
+        let px_mm = stack.px_mm() as f32;
+        let [mut low, mut high] = [[f32::INFINITY; 2], [f32::NEG_INFINITY; 2]];
+        for edge in stack.edges() {
+            let [x, y] = edge.at_mm;
+            let at = [cos * x + sin * y, cos * y - sin * x];
+            for k in 0..2 {
+                low[k] = low[k].min(at[k]);
+                high[k] = high[k].max(at[k]);
+            }
+        }
+        let margin = f32::from(MARGIN);
+        let count = |k: usize| ((high[k] - low[k]) / px_mm + 2.0 * margin + 1.0) as usize;
+        if stack.edges().is_empty() {
+            return None;
+        }
+        let origin = low.map(|low| low - margin * px_mm);
+        let turned = Turned { sin, cos, origin, columns: count(0), rows: count(1), px_mm };
+        let (columns, n) = (turned.columns, turned.columns * turned.rows);
+        if n > self.grid.len() {
+            return None;
+        }
+        for row in 0..turned.rows {
+            for column in 0..columns {
+                let (x, y) = turned.point(column as f32, row as f32);
+                let value = if stack.is_seen(x, y) { 0 } else { UNSEEN };
+                self.grid[row * columns + column] = [value; 2];
+            }
+        }
+        for edge in stack.edges() {
+            let [x, y] = edge.at_mm;
+            let (column, row) = turned.cell(x, y);
+            let i = row * columns + column;
+            let across = cos * edge.step[0] + sin * edge.step[1];
+            let up = cos * edge.step[1] - sin * edge.step[0];
+            let value = (edge.agreement * f32::from(WHOLE)).round() as u8;
+            // A pixel along the side, too: turned pixels leave holes.
+            for (k, _) in
+                [across, up].iter().enumerate().filter(|(_, step)| step.abs() > ACROSS_MIN)
+            {
+                for i in [i - columns, i - 1, i, i + 1, i + columns] {
+                    let cell = &mut self.grid[i][k];
+                    *cell = if *cell == UNSEEN { UNSEEN } else { value.max(*cell) };
+                }
+            }
+        }
+        Some(turned)
+    }
+
+    fn sum_up(&mut self, turned: &Turned) {
+        let columns = turned.columns;
+        let value = |edge: u8| match edge {
+            UNSEEN => 0,
+            edge => 2 * i32::from(edge) - i32::from(WHOLE),
+        };
+        for row in 0..turned.rows {
+            let mut sum = 0;
+            for column in 0..columns {
+                let i = row * columns + column;
+                sum += value(self.grid[i][1]);
+                self.along[i] = sum;
+                let above = if row > 0 { self.down[i - columns] } else { 0 };
+                self.down[i] = above + value(self.grid[i][0]);
+            }
+        }
+    }
+}
+
+/// Pixels around the edges in the turned grid.
+const MARGIN: u8 = 3;
+
+/// Directions of the sides, radians, that most edges around a point have.
+fn directions(stack: &Stack, inside_mm: [f32; 2]) -> [Option<f32>; DIRECTIONS] {
+    let mut counts = [0.0f32; BINS];
+    for edge in stack.edges() {
+        let [dx, dy] = [edge.at_mm[0] - inside_mm[0], edge.at_mm[1] - inside_mm[1]];
+        let distance = (dx * dx + dy * dy) / (DIRECTION_REACH_MM * DIRECTION_REACH_MM);
+        let degrees = edge.step[1].atan2(edge.step[0]).to_degrees().rem_euclid(90.0);
+        counts[(2.0 * degrees) as usize % BINS] += edge.weight * (-0.5 * distance).exp();
+    }
+    let smooth: [f32; BINS] = std::array::from_fn(|i| {
+        (0..9).map(|d| SMOOTH[d] * counts[(i + BINS + d - 4) % BINS]).sum()
+    });
+    let mut found = [None; DIRECTIONS];
+    let mut taken = [false; BINS];
+    for direction in &mut found {
+        let free = (0..BINS).filter(|&i| !taken[i] && smooth[i] > 0.0);
+        let Some(best) = free.max_by(|&a, &b| smooth[a].total_cmp(&smooth[b])) else { break };
+        for d in 0..=2 * DIRECTIONS_APART {
+            taken[(best + BINS + d - DIRECTIONS_APART) % BINS] = true;
+        }
+        *direction = Some((0.5 * best as f32 + 0.25).to_radians());
+    }
+    found
+}
+
+/// A Gaussian of two bins.
+const SMOOTH: [f32; 9] = [0.03, 0.07, 0.12, 0.18, 0.2, 0.18, 0.12, 0.07, 0.03];
+
+/// Share of a side that is edge; of what is seen, if half of it is.
+fn share(side: impl Iterator<Item = u8>) -> f64 {
+    let (mut edge, mut seen, mut all) = (0u32, 0u32, 0u32);
+    for value in side {
+        all += 1;
+        if value != UNSEEN {
+            seen += 1;
+            edge += u32::from(value);
+        }
+    }
+    f64::from(edge) / f64::from((u32::from(WHOLE) * seen.max(all / 2)).max(1))
+}
+
+/// The largest rise within running sums.
+fn longest_stretch(sums: impl Iterator<Item = i32>) -> i32 {
+    let (mut lowest, mut most) = (0, 0);
+    for sum in sums {
+        most = most.max(sum - lowest);
+        lowest = lowest.min(sum);
+    }
+    most
+}
+
+/// The lines of longest stretches, no two side by side; as many as there is room for.
+fn lines(
+    places: std::ops::Range<usize>,
+    stretch: impl Fn(usize) -> i32,
+    found: &mut [usize; LINES],
+) -> &[usize] {
+    let mut stretches = [0i32; LINES];
+    let mut count = 0;
+    let mut run: Option<(usize, usize, i32)> = None;
+    let mut keep = |place: usize, stretch: i32| {
+        let at = stretches[..count].iter().position(|&s| s < stretch).unwrap_or(count);
+        if at == LINES {
+            return;
+        }
+        count = (count + 1).min(LINES);
+        stretches.copy_within(at..count - 1, at + 1);
+        found.copy_within(at..count - 1, at + 1);
+        (stretches[at], found[at]) = (stretch, place);
+    };
+    // Local maxima; of a plateau its middle.
+    let mut before = 0;
+    for place in places.clone() {
+        let here = stretch(place);
+        if here > before {
+            run = Some((place, place, here));
+        } else if here == before {
+            run = run.map(|(from, _, s)| (from, place, s));
+        } else if let Some((from, to, s)) = run.take() {
+            keep(usize::midpoint(from, to), s);
+        }
+        before = here;
+    }
+    if let Some((from, to, s)) = run {
+        keep(usize::midpoint(from, to), s);
+    }
+    let enough =
+        stretches[..count].iter().take_while(|&&s| s >= STRETCH_MIN_PX * i32::from(WHOLE)).count();
+    &found[..enough]
+}
