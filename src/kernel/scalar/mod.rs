@@ -1,6 +1,7 @@
 //! Plain Rust, written to be read: what every faster kernel is compared with.
 
 pub mod bits;
+pub mod box_filter;
 pub mod flow;
 pub mod mixture;
 pub mod profile;

@@ -8,15 +8,14 @@ use crate::camera::BeltView;
 use crate::error::Result;
 use crate::image::Plane;
 use crate::kernel::scalar::bits::{self, words};
+use crate::kernel::scalar::box_filter::{REACH, box_filter};
 use crate::plan::{Block, Memory, Plan};
 use crate::stage::views::VIEWS_MAX;
 
 /// Side of a cell, about.
 const CELL_MM: f64 = 3.5;
-/// The slow part is what a window of this many cells to either side makes of it, twice.
-const WINDOW: usize = 2;
 /// Added to grey values, so that noise in the dark does not become structure.
-const DARK_GREY: f32 = 6.0;
+pub(in crate::stage) const DARK_GREY: f32 = 6.0;
 /// Units of a cell's value for a factor of e.
 const UNITS: f32 = 160.0;
 /// A cell that the camera does not see.
@@ -78,7 +77,7 @@ impl Cells {
                 && is_seen(u, v + last)
                 && is_seen(u + last, v + last)
         };
-        let reach = 2 * WINDOW;
+        let reach = 2 * REACH;
         for column in reach..columns.saturating_sub(reach) {
             for row in reach..rows.saturating_sub(reach) {
                 usable[column * rows + row] = [column - reach, column + reach]
@@ -133,47 +132,5 @@ impl Cells {
     pub fn view(&self, place: usize) -> &[i8] {
         let n = self.size[0] * self.size[1];
         &self.values[place * n..][..n]
-    }
-}
-
-/// Mean over [`WINDOW`] neighbours to either side of every `step`-th of `values`, `count` of them; the
-/// ends stay.
-fn box_filter(values: &mut [f32], step: usize, count: usize) {
-    const WIDTH: usize = 2 * WINDOW + 1;
-    if count < WIDTH {
-        return;
-    }
-    // What the means have already overwritten: a ring of the last values.
-    let mut ring = [0.0f32; WIDTH];
-    let mut sum = 0.0;
-    for i in 0..2 * WINDOW {
-        ring[i] = values[i * step];
-        sum += ring[i];
-    }
-    for i in WINDOW..count - WINDOW {
-        let (new, oldest) = (values[(i + WINDOW) * step], (i + WINDOW + 1) % WIDTH);
-        ring[(i + WINDOW) % WIDTH] = new;
-        sum += new;
-        values[i * step] = sum / WIDTH as f32;
-        sum -= ring[oldest];
-    }
-}
-
-#[cfg(test)]
-mod tests {
-    use super::*;
-
-    #[test]
-    fn the_slow_part_is_the_mean_of_five() {
-        let values: Vec<f32> = (0..12).map(|i| ((i * 7) % 5) as f32).collect();
-        let mut columns: Vec<f32> = values.iter().flat_map(|&v| [v, -1.0]).collect();
-        box_filter(&mut columns, 2, values.len());
-        for i in 0..12 {
-            let inside = (2..10).contains(&i);
-            let mean =
-                if inside { values[i - 2..=i + 2].iter().sum::<f32>() / 5.0 } else { values[i] };
-            assert!((columns[2 * i] - mean).abs() < 1e-5, "{i}");
-        }
-        assert!(columns.iter().skip(1).step_by(2).all(|&v| (v + 1.0).abs() < 1e-6));
     }
 }

@@ -16,6 +16,8 @@ use crate::stage::views::Views;
 use crate::units::BeltRect;
 use cells::{Cells, UNSEEN};
 
+pub(super) use cells::DARK_GREY;
+
 /// Trial planes of a pass over the zone are so far apart that their images part by this many cells
 /// there: an eighth of the coarsest structure.
 const PLANE_STEP_CELLS: f64 = 1.5;

@@ -246,9 +246,8 @@ impl Parcels {
                 waiting.push(here);
                 continue;
             }
-            let mut heights: Vec<f32> = members.iter().map(|&i| self.cells[i].height_mm).collect();
-            heights.sort_by(f32::total_cmp);
-            let height_mm = f64::from(heights[heights.len() / 2]);
+            let heights_mm = members.iter().map(|&i| f64::from(self.cells[i].height_mm));
+            let height_mm = middle_of(heights_mm);
             whole.push((members, height_mm));
         }
         whole

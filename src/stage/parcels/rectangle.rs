@@ -195,16 +195,10 @@ impl RectangleSearch {
 
     /// The best rectangle around a point whose direction is known to a degree.
     pub fn near(&mut self, stack: &Stack, inside_mm: [f32; 2], yaw: f32) -> Option<Rectangle> {
-        let mut best: Option<Rectangle> = None;
-        for turn in NEAR_TURNS_DEG {
-            let found = self.best_at(stack, inside_mm, yaw + turn.to_radians());
-            if let Some(found) = found
-                && best.is_none_or(|best| found.score_mm > best.score_mm)
-            {
-                best = Some(found);
-            }
-        }
-        best
+        let turned = NEAR_TURNS_DEG
+            .into_iter()
+            .filter_map(|turn| self.best_at(stack, inside_mm, yaw + turn.to_radians()));
+        turned.max_by(|a, b| a.score_mm.total_cmp(&b.score_mm))
     }
 
     fn best_at(&mut self, stack: &Stack, inside_mm: [f32; 2], yaw: f32) -> Option<Rectangle> {
@@ -280,7 +274,6 @@ impl RectangleSearch {
     pub fn narrower(&mut self, stack: &Stack, outer: &Rectangle) -> [Option<Rectangle>; 4] {
         let yaw = outer.yaw as f32;
         let Some(turned) = self.turn(stack, yaw) else { return [None; 4] };
-        self.sum_up(&turned);
         let px_mm = f64::from(turned.px_mm);
         let (column, row) = turned.cell(outer.x_mm as f32, outer.y_mm as f32);
         let half = |length_mm: f64| (0.5 * length_mm / px_mm).round() as usize;

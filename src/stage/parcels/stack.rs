@@ -8,7 +8,9 @@
 use crate::camera::BeltView;
 use crate::error::Result;
 use crate::kernel::scalar::bits::{self, words};
+use crate::kernel::scalar::box_filter::{self, box_filter};
 use crate::plan::{Block, Memory, Plan};
+use crate::stage::evidence::DARK_GREY;
 use crate::stage::views::Views;
 use crate::units::BeltRect;
 
@@ -16,8 +18,6 @@ use crate::units::BeltRect;
 const PX_MM: f64 = 2.0;
 /// A window's sides at most, mm: the longest parcel, with its surroundings.
 const WINDOW_MAX_MM: f64 = 1000.0;
-/// Added to grey values, so that noise in the dark does not become structure.
-const DARK_GREY: f32 = 6.0;
 /// A step's share that is the same in all views.
 const SEMBLANCE_MIN: f32 = 0.4;
 /// From this share on the views agree wholly: focus is exact to a pixel or two over the pass.
@@ -28,12 +28,8 @@ const STEP_SIGMA_MIN: f32 = 4.0;
 const STEP_MIN: f32 = 0.012;
 /// Fewer views than this agree by accident.
 const VIEWS_MIN: f32 = 6.0;
-/// The slow part is the mean of this many pixels to either side, both ways, twice.
-const SLOW_PX: usize = 2;
 /// A step is told with this many pixels to either side.
-const REACH_PX: usize = 2 * SLOW_PX + 1;
-/// Columns of a window at most.
-const LINE_MAX: usize = (WINDOW_MAX_MM / PX_MM) as usize + 1;
+const REACH_PX: usize = 2 * box_filter::REACH + 1;
 /// Classes of brightness in which noise is told, each this wide (logarithm), ...
 const CLASS_LOG: f32 = 0.15;
 /// ... from 0 + [`DARK_GREY`] to 255.
@@ -67,6 +63,18 @@ pub struct EdgePixel {
     pub agreement: f32,
 }
 
+/// Sums over the views.
+#[derive(Clone, Copy, Default)]
+struct Sums {
+    /// Step along X and Y.
+    step: [f32; 2],
+    /// Its squared length.
+    energy: f32,
+    /// Logarithm of the grey value.
+    log: f32,
+    views: f32,
+}
+
 /// The stack of one window at a time.
 pub struct Stack {
     geometry: BeltView,
@@ -79,8 +87,7 @@ pub struct Stack {
     log_of: [f32; 256],
     log: Block<f32>,
     slow: Block<f32>,
-    /// Sums over the views: step along x and y, energy, logarithm, views.
-    sums: Block<[f32; 5]>,
+    sums: Block<Sums>,
     edges: Block<EdgePixel>,
     edge_count: usize,
 }
@@ -99,7 +106,7 @@ impl Stack {
         let n = columns * rows;
         plan.add::<f32>("stack.log", n, "one view on a plane");
         plan.add::<f32>("stack.slow", n, "its slow part");
-        plan.add::<[f32; 5]>("stack.sums", n, "steps and energies over the views");
+        plan.add::<Sums>("stack.sums", n, "steps and energies over the views");
         plan.add::<EdgePixel>("stack.edges", n, "edge pixels of a plane");
     }
 
@@ -116,7 +123,7 @@ impl Stack {
             log_of: std::array::from_fn(|grey| (grey as f32 + DARK_GREY).ln()),
             log: memory.take("stack.log", 0.0)?,
             slow: memory.take("stack.slow", 0.0)?,
-            sums: memory.take("stack.sums", [0.0; 5])?,
+            sums: memory.take("stack.sums", Sums::default())?,
             edges: memory.take("stack.edges", EdgePixel::default())?,
             edge_count: 0,
         })
@@ -147,7 +154,7 @@ impl Stack {
         inside
             && column < self.columns
             && row < self.rows
-            && self.sums[row * self.columns + column][4] >= VIEWS_MIN
+            && self.sums[row * self.columns + column].views >= VIEWS_MIN
     }
 
     /// Stack the views on a window, cut to the zone's width and to what there is memory for.
@@ -159,7 +166,7 @@ impl Stack {
         self.columns = count(window.x_mm[1] - window.x_mm[0]).min(columns_max);
         self.rows = count(y_max_mm - y_min_mm).min(rows_max);
         self.origin_mm = [window.x_mm[0], y_max_mm];
-        self.sums[..self.columns * self.rows].fill([0.0; 5]);
+        self.sums[..self.columns * self.rows].fill(Sums::default());
         for place in views.places() {
             let travel_mm = views.kept(place).at.travel_mm;
             let (first_mm, last_mm) = (window.x_mm[0] + travel_mm, window.x_mm[1] + travel_mm);
@@ -241,46 +248,26 @@ impl Stack {
                 if energy.is_nan() {
                     continue;
                 }
-                let [x, y, e, l, n] = &mut self.sums[i];
-                *x += dx;
-                *y += dy;
-                *e += energy;
-                *l += fine[i] + self.slow[i];
-                *n += 1.0;
+                let sums = &mut self.sums[i];
+                sums.step[0] += dx;
+                sums.step[1] += dy;
+                sums.energy += energy;
+                sums.log += fine[i] + self.slow[i];
+                sums.views += 1.0;
             }
         }
     }
 
     fn take_out_the_slow_part(&mut self, columns: &std::ops::Range<usize>) {
-        const WIDTH: usize = 2 * SLOW_PX + 1;
         let (width, rows) = (self.columns, self.rows);
-        let mut line = [0.0f32; LINE_MAX];
         self.slow[..rows * width].copy_from_slice(&self.log[..rows * width]);
-        for row in 0..rows {
-            let slow = &mut self.slow[row * width..][columns.clone()];
-            for _ in 0..2 {
-                let n = slow.len();
-                line[..n].copy_from_slice(slow);
-                for i in SLOW_PX..n - SLOW_PX {
-                    slow[i] = line[i - SLOW_PX..=i + SLOW_PX].iter().sum::<f32>() / WIDTH as f32;
-                }
-            }
-        }
-        // Down the columns, a row at a time: the rows above are kept as they were.
         for _ in 0..2 {
-            let mut above = [[0.0f32; LINE_MAX]; SLOW_PX];
-            for (k, above) in above.iter_mut().enumerate() {
-                above[columns.clone()].copy_from_slice(&self.slow[k * width..][columns.clone()]);
+            for row in 0..rows {
+                let line = &mut self.slow[row * width + columns.start..];
+                box_filter(line, 1, columns.len());
             }
-            for row in SLOW_PX..rows - SLOW_PX {
-                for column in columns.clone() {
-                    let at = |r: usize| self.slow[r * width + column];
-                    let here = at(row);
-                    let below = (1..=SLOW_PX).map(|k| at(row + k)).sum::<f32>();
-                    let sum = above.iter().map(|above| above[column]).sum::<f32>() + here + below;
-                    self.slow[row * width + column] = sum / WIDTH as f32;
-                    above[row % SLOW_PX][column] = here;
-                }
+            for column in columns.clone() {
+                box_filter(&mut self.slow[column..], width, rows);
             }
         }
         for row in 0..rows {
@@ -295,7 +282,8 @@ impl Stack {
         self.edge_count = 0;
         for row in 0..self.rows {
             for column in 0..self.columns {
-                let [x, y, energy, log, n] = self.sums[row * self.columns + column];
+                let Sums { step: [x, y], energy, log, views: n } =
+                    self.sums[row * self.columns + column];
                 if n < VIEWS_MIN {
                     continue;
                 }
@@ -326,7 +314,7 @@ impl Stack {
     /// Energy of noise in each class of brightness.
     fn noise(&self) -> [f32; CLASSES] {
         let mut counts = [[0u32; ENERGY_BINS]; CLASSES];
-        for &[_, _, energy, log, n] in &self.sums[..self.columns * self.rows] {
+        for &Sums { energy, log, views: n, .. } in &self.sums[..self.columns * self.rows] {
             if n >= VIEWS_MIN {
                 let bin = 4.0 * ((energy / n).max(1e-9).log2() + 24.0);
                 let bin = (bin.max(0.0) as usize).min(ENERGY_BINS - 1);

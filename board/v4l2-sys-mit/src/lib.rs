@@ -1,4 +1,4 @@
-//! What the crate `v4l` needs of the kernel's `videodev2.h`, made by `vendor/v4l2-sys-mit/regenerate`.
+//! What the crate `v4l` needs of the kernel's `videodev2.h`, made by `board/v4l2-sys-mit/regenerate`.
 //!
 //! The interface is the kernel's stable one, and the same for x86-64 and ARM64. The sizes and offsets in
 //! `bindings.rs` are checked by the compiler in every build.
