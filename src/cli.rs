@@ -64,7 +64,7 @@ pub enum Command {
         /// Address and port of the Modbus server [default: 0.0.0.0:1502].
         #[arg(long, value_name = "ADDRESS:PORT", help_heading = BELT)]
         listen: Option<SocketAddr>,
-        /// Address and port of the page [default: 0.0.0.0:8080].
+        /// Address and port of the page [default: 127.0.0.1:8080, for this computer alone].
         #[arg(long, value_name = "ADDRESS:PORT", help_heading = BELT)]
         page: Option<SocketAddr>,
         /// Folder for the table, the records and the annotated pictures.
