@@ -1,12 +1,12 @@
 //! The page's server as strangers meet it, and the page's texts.
 
 use beltgauge::config::Web;
-use beltgauge::event::{Flags, NotMeasured};
+use beltgauge::event::{Flags, NotMeasured, ParcelRecord, Shape};
 use beltgauge::plc::command::COMMANDS;
 use beltgauge::plc::registers::REASONS;
-use beltgauge::web::{self, Archived, Board, Event, Machine, Plc, State, View};
+use beltgauge::web::{self, Archived, Board, Event, Machine, Parcel, Plc, State, View};
 use std::collections::{BTreeMap, BTreeSet};
-use std::io::{Read, Write};
+use std::io::{ErrorKind, Read, Write};
 use std::net::{SocketAddr, TcpStream};
 use std::path::Path;
 use std::sync::Arc;
@@ -113,6 +113,7 @@ fn what_is_there_is_served_and_every_answer_is_protected() {
         ("/api/archive/7/picture", 200),
         ("/api/archive/8/picture", 404),
         ("/api/archive/x/picture", 404),
+        ("/api/parcels.csv", 200),
         ("/api/parcels/1/picture", 404),
         ("/api/parcels/-1/picture", 404),
         ("/api/live/up", 404),
@@ -205,6 +206,64 @@ fn one_address_has_half_of_the_places_and_gets_them_back() {
     }
 }
 
+/// A connection from another address of this machine.
+fn connect_from(local: [u8; 4], server: SocketAddr) -> TcpStream {
+    use rustix::net::{AddressFamily, SocketType, bind, connect, socket};
+    let socket = socket(AddressFamily::INET, SocketType::STREAM, None).expect("a socket");
+    bind(&socket, &SocketAddr::from((local, 0))).expect("all of 127 is this machine");
+    connect(&socket, &server).expect("listens");
+    let stream = TcpStream::from(socket);
+    stream.set_read_timeout(Some(PATIENCE)).expect("a time");
+    stream
+}
+
+#[test]
+fn of_a_hundred_at_once_as_many_are_served_as_have_places_and_others_find_one() {
+    const ASKED: &[u8] = b"GET /api/state HTTP/1.1\r\nHost: localhost\r\n\r\n";
+    let server = Server::start();
+    let mut crowd: Vec<TcpStream> = (0..100).map(|_| server.connect()).collect();
+    let is_served = |stream: &mut TcpStream| {
+        let mut some = [0; 12];
+        // One too many may be hung up on while it talks.
+        stream.write_all(ASKED).and_then(|()| stream.read_exact(&mut some)).is_ok()
+            && some == *b"HTTP/1.1 200"
+    };
+    // All of them stay: who was served has not given its place back.
+    let served = crowd.iter_mut().map(is_served).filter(|served| *served).count();
+    assert_eq!(served, Web::default().connections_max / 2);
+    let mut other = connect_from([127, 0, 0, 2], server.address);
+    assert!(is_served(&mut other), "another visitor is locked out");
+}
+
+#[test]
+fn who_asks_a_byte_at_a_time_is_ended_and_others_are_served() {
+    let server = Server::start();
+    let mut slow = server.connect();
+    let start = Instant::now();
+    // A head that never ends: no byte is late, the whole is.
+    slow.write_all(b"GET / HTTP/1.1\r\nHost: localhost\r\nX: ").expect("open");
+    while slow.write_all(b"x").is_ok() {
+        assert!(start.elapsed() < PATIENCE, "it is waited for");
+        assert_eq!(status(&server.get("/api/state")), 200, "others are served meanwhile");
+        std::thread::sleep(Duration::from_millis(100));
+    }
+}
+
+#[test]
+fn who_asks_and_takes_no_answer_is_ended_and_others_are_served() {
+    let server = Server::start();
+    let mut deaf = server.connect();
+    deaf.set_write_timeout(Some(PATIENCE)).expect("a time");
+    // When nothing is taken the server stops to read, and then this stops to write.
+    let end = loop {
+        if let Err(error) = deaf.write_all(b"GET /main.js HTTP/1.1\r\nHost: localhost\r\n\r\n") {
+            break error.kind();
+        }
+    };
+    assert!(matches!(end, ErrorKind::ConnectionReset | ErrorKind::BrokenPipe), "{end}");
+    assert_eq!(status(&server.get("/api/state")), 200);
+}
+
 #[test]
 fn who_does_not_finish_a_request_is_disconnected() {
     let server = Server::start();
@@ -234,6 +293,63 @@ fn a_live_picture_comes_when_it_is_put_up_and_only_then() {
         assert!(answer.ends_with("{\"frame\":7}\nJPEG"), "{answer}");
     });
     assert!(!board.is_wanted(View::Belt), "nobody looks any more");
+}
+
+fn parcel(seq: u32) -> Parcel {
+    let record = ParcelRecord {
+        seq,
+        frame: 137,
+        t_s: 3.425,
+        length_mm: 235.1,
+        width_mm: 124.8,
+        height_mm: 70.2,
+        yaw_deg: -12.4,
+        x_mm: 61.0,
+        y_mm: -40.3,
+        sigma_length_mm: 0.3,
+        sigma_width_mm: 0.2,
+        sigma_height_mm: 0.5,
+        belt_speed_mm_per_s: 500.3,
+        shape: Shape::Box,
+        flags: Flags::default(),
+        not_measured: None,
+        may_be_used: true,
+        belt_travel_mm: 1712.5,
+        by_encoder: false,
+    };
+    Parcel { n: 0, utc_ms: 1_795_000_000_123, record, picture: None }
+}
+
+#[test]
+fn the_last_parcels_are_a_table_for_a_spreadsheet() {
+    let server = Server::start();
+    for seq in 41..=43 {
+        server.board.parcel(parcel(seq), Vec::new());
+    }
+    let answer = server.get("/api/parcels.csv");
+    assert!(answer.contains("content-type: text/csv; charset=utf-8\r\n"), "{answer}");
+    assert!(answer.contains("content-disposition: attachment; filename=\"parcels.csv\"\r\n"));
+    let (_, table) = answer.split_once("\r\n\r\n").expect("an answer");
+    let lines: Vec<Vec<&str>> = table.lines().map(|line| line.split(',').collect()).collect();
+    assert_eq!(lines.len(), 4, "{table}");
+    let cell = |name: &str| {
+        let column = lines[0].iter().position(|head| *head == name);
+        lines[3][column.unwrap_or_else(|| panic!("no column {name}"))]
+    };
+    for (name, value) in [
+        ("n", "3"),
+        ("utc", "2026-11-18T11:06:40.123Z"),
+        ("seq", "43"),
+        ("length_mm", "235.1"),
+        ("yaw_deg", "-12.4"),
+        ("shape", "box"),
+        ("flags", ""),
+        ("not_measured", ""),
+        ("may_be_used", "true"),
+        ("version", "1.2.3"),
+    ] {
+        assert_eq!(cell(name), value, "{name}");
+    }
 }
 
 #[test]

@@ -10,12 +10,10 @@
 //! an entry breaks the chain; whoever may write the disk can forge a whole new one, unless the last sum
 //! was noted elsewhere. A slow, full or broken disk costs entries, which are counted: nobody waits for it.
 
-mod export;
 mod reader;
 mod segment;
 mod writer;
 
-pub use export::{Columns, csv_line, utc};
 pub use reader::{Reader, Stored, Verdict};
 pub use writer::{Archive, Condition};
 

@@ -1,7 +1,8 @@
 //! `beltgauge archive`: what was seen, listed, exported, verified.
 
-use crate::archive::{Columns, Kind, Reader, Stored, csv_line, utc};
+use crate::archive::{Kind, Reader, Stored};
 use crate::error::{Error, Result};
+use crate::event::csv as columns;
 use std::fmt::Write as _;
 use std::fs::File;
 use std::io::{BufWriter, Write};
@@ -23,8 +24,13 @@ pub fn list(folder: &Path, last: usize) -> Result<String> {
     let mut text = String::new();
     for stored in Reader::open(folder)?.before(None, last)? {
         // Writing to a string does not fail.
-        let _ =
-            writeln!(text, "{:8}  {}  {}", stored.number, utc(stored.entry.utc_ms), line(&stored));
+        let _ = writeln!(
+            text,
+            "{:8}  {}  {}",
+            stored.number,
+            columns::utc(stored.entry.utc_ms),
+            line(&stored)
+        );
     }
     Ok(text)
 }
@@ -68,7 +74,7 @@ pub fn export(folder: &Path, to: Export<'_>) -> Result<String> {
     let mut csv = to.csv.map(Lines::create).transpose()?;
     let mut jsonl = to.jsonl.map(Lines::create).transpose()?;
     if let Some(csv) = &mut csv {
-        csv.write(&Columns::header())?;
+        csv.write(&columns::header("entry"))?;
     }
     if let Some(pictures) = to.pictures {
         std::fs::create_dir_all(pictures).map_err(|e| unwritable(&e, pictures))?;
@@ -78,7 +84,8 @@ pub fn export(folder: &Path, to: Export<'_>) -> Result<String> {
         let is_parcel = stored.entry.kind == Kind::Parcel;
         parcels += u64::from(is_parcel);
         if let Some(csv) = csv.as_mut().filter(|_| is_parcel) {
-            csv.write(&csv_line(&stored))?;
+            let record = serde_json::from_str(&stored.entry.text).unwrap_or_default();
+            csv.write(&columns::line(stored.number, stored.entry.utc_ms, &record))?;
         }
         if let Some(jsonl) = &mut jsonl {
             let (number, kind) = (stored.number, stored.entry.kind.name());

@@ -5,6 +5,7 @@ use super::board::{Board, PARCELS_MAX, View};
 use super::guard::{self, Hosts};
 use super::metrics;
 use super::model::{Archived, Event, Machine, Parcel};
+use crate::event::csv;
 use axum::extract::{Path, RawQuery, Request, State};
 use axum::http::{Method, StatusCode, header};
 use axum::middleware::{self, Next};
@@ -40,6 +41,7 @@ pub(super) fn router(board: Arc<Board>, machine: Arc<dyn Machine>, hosts: Hosts)
         .route("/api/state", get(state))
         .route("/api/plc", get(plc))
         .route("/api/parcels", get(parcels))
+        .route("/api/parcels.csv", get(parcels_csv))
         .route("/api/parcels/{n}/picture", get(parcel_picture))
         .route("/api/events", get(events))
         .route("/api/live/{view}", get(live))
@@ -133,6 +135,27 @@ async fn parcels(
     let limit = number(query.as_deref(), "limit")?.map_or(PARCELS_MAX, |n| n as usize);
     let items = from.board.parcels_since(since, limit);
     Ok(listed(&from.board, &items, since, |parcel: &Parcel| parcel.n))
+}
+
+/// The last parcels, for a spreadsheet.
+async fn parcels_csv(State(from): State<Sources>) -> Response {
+    let state = from.machine.state();
+    let mut text = csv::header("n");
+    for parcel in from.board.parcels_since(0, PARCELS_MAX) {
+        let mut record = serde_json::to_value(&*parcel).unwrap_or_default();
+        if let Some(record) = record.as_object_mut() {
+            record.insert("boots".to_owned(), state.boots.into());
+            record.insert("version".to_owned(), state.version.into());
+        }
+        text.push('\n');
+        text.push_str(&csv::line(parcel.n, parcel.utc_ms, &record));
+    }
+    text.push('\n');
+    let headers = [
+        (header::CONTENT_TYPE, "text/csv; charset=utf-8"),
+        (header::CONTENT_DISPOSITION, "attachment; filename=\"parcels.csv\""),
+    ];
+    (headers, text).into_response()
 }
 
 async fn events(

@@ -3,10 +3,12 @@
 import { askJson, chooseLanguage, count, every, h, number, otherLanguage, remember, remembered, t, time, whenSilent } from "./common.js";
 import { events } from "./events.js";
 import { overview } from "./overview.js";
-import { parcels } from "./parcels.js";
+import { parcel, parcels } from "./parcels.js";
 import { plc } from "./plc.js";
 
 const PAGES = { overview, parcels, plc, events };
+// Reached from the list.
+const OTHERS = { parcel };
 const THEMES = ["auto", "light", "dark"];
 const element = (id) => document.getElementById(id);
 let leave = new AbortController();
@@ -32,8 +34,9 @@ function showLamps(state) {
 }
 
 function show() {
-  const name = location.hash.slice(1).split("/")[0];
-  const page = name in PAGES ? name : "overview";
+  const [name, ...where] = location.hash.slice(1).split("/");
+  const all = { ...PAGES, ...OTHERS };
+  const page = Object.hasOwn(all, name) ? name : "overview";
   leave.abort();
   leave = new AbortController();
   element("dialog").close();
@@ -45,7 +48,7 @@ function show() {
   showTheme();
   const main = element("main");
   main.replaceChildren(h("h1", {}, t(`page.${page}`)));
-  PAGES[page](main, leave.signal);
+  all[page](main, leave.signal, where);
   // What is known is shown at once, in the language that was chosen.
   if (newest) tell(newest);
 }

@@ -20,7 +20,7 @@ export function parcelTable(signal, { title, most, filters }) {
   let [known, since, run, filter] = [[], 0, null, "all"];
   const show = () => {
     const shown = known.filter(FILTERS[filter]).slice(-most).reverse();
-    body.replaceChildren(...shown.map((parcel) => row(parcel, `/api/parcels/${parcel.n}/picture`)));
+    body.replaceChildren(...shown.map((parcel) => row(parcel, `${parcel.n}`)));
     empty.hidden = shown.length > 0;
   };
   const choice = h("select", { "aria-label": t("parcels.filter"), onchange: (event) => { filter = event.target.value; show(); } },
@@ -37,7 +37,7 @@ export function parcelTable(signal, { title, most, filters }) {
     run = list.run;
   });
   return h("section", { class: "card" },
-    h("div", { class: "bar" }, h("h2", {}, title), filters ? h("span", { class: "end" }, choice) : null,
+    h("div", { class: "bar" }, h("h2", {}, title), filters ? h("span", { class: "end" }, h("a", { href: "/api/parcels.csv", download: "parcels.csv" }, t("parcels.csv")), " ", choice) : null,
       filters ? null : h("a", { class: "end", href: "#parcels" }, t("parcels.all"))),
     table(body), empty);
 }
@@ -50,7 +50,7 @@ function archived(signal) {
     try {
       const list = await askJson(`/api/archive?limit=100${before === null ? "" : `&before=${before}`}`, signal);
       for (const { entry, kind, what } of list.entries) {
-        if (kind === "parcel") body.append(row(what, `/api/archive/${entry}/picture`));
+        if (kind === "parcel") body.append(row(what, `archive/${entry}`));
       }
       before = list.before;
       notice.textContent = before === null ? t("archive.end") : "";
@@ -70,11 +70,38 @@ function table(body) {
     body));
 }
 
-function row(parcel, path) {
+// A parcel's place: `N` since start, `archive/ENTRY` on the disk.
+const picturePath = (place) => (place.startsWith("archive/") ? `/api/${place}/picture` : `/api/parcels/${place}/picture`);
+
+// One parcel, by an address that can be passed on: that of the archive holds over restarts.
+export async function parcel(main, signal, where) {
+  const place = where.join("/");
+  const [, archive, number] = /^(archive\/)?(\d{1,15})$/.exec(place) ?? [];
+  const card = h("section", { class: "card" }, h("p", { class: "soft" }, t("parcel.waiting")));
+  main.append(h("p", {}, h("a", { href: "#parcels" }, t("parcels.all"))), card);
+  let found = null;
+  try {
+    if (archive) {
+      const { entries } = await askJson(`/api/archive?before=${Number(number) + 1}&limit=1`, signal);
+      found = entries.find((one) => one.entry === Number(number) && one.kind === "parcel")?.what;
+    } else if (number) {
+      const { items } = await askJson(`/api/parcels?since=${Math.max(Number(number) - 1, 0)}`, signal);
+      found = items.find((one) => one.n === Number(number));
+    }
+  } catch (error) {
+    if (signal.aborted) return;
+    card.replaceChildren(h("p", {}, `${t("archive.unreadable")} ${error.message}`));
+    return;
+  }
+  if (signal.aborted) return;
+  card.replaceChildren(...(found ? details(found, place) : [h("p", {}, t("parcel.unknown"))]));
+}
+
+function row(parcel, place) {
   const size = (mm, sigma) => h("td", { class: "number" }, parcel.not_measured !== null ? "–" : [number(mm), h("span", { class: "sigma" }, ` ± ${number(sigma, 2)}`)]);
   return h("tr", {},
-    h("td", {}, parcel.picture ? picture(parcel, path, false) : ""),
-    h("td", {}, h("button", { type: "button", class: "link", title: t("parcel.open"), onclick: () => open(parcel, path) }, `${parcel.seq}`)),
+    h("td", {}, parcel.picture ? picture(parcel, picturePath(place), false) : ""),
+    h("td", {}, h("button", { type: "button", class: "link", title: t("parcel.open"), onclick: () => open(parcel, place) }, `${parcel.seq}`)),
     h("td", {}, time(parcel.utc_ms)),
     size(parcel.length_mm, parcel.sigma_length_mm),
     size(parcel.width_mm, parcel.sigma_width_mm),
@@ -93,6 +120,8 @@ function doubts(parcel) {
   const words = parcel.flags.map((flag) => t(`flag.${flag}`));
   if (parcel.not_measured !== null) words.unshift(t(`not_measured.${parcel.not_measured}`));
   if (parcel.shape === "irregular" && parcel.not_measured === null) words.push(t("shape.irregular"));
+  // No flag, and yet not to be used: that is the sigma.
+  if (words.length === 0 && !parcel.may_be_used) words.push(t("parcel.sigma"));
   return words.join("; ");
 }
 
@@ -114,20 +143,27 @@ function picture(parcel, path, large) {
   return frame;
 }
 
-function open(parcel, path) {
+function open(parcel, place) {
   const dialog = document.getElementById("dialog");
+  dialog.replaceChildren(
+    h("div", { class: "bar" }, h("a", { href: `#parcel/${place}` }, t("parcel.page")),
+      h("button", { type: "button", class: "end", onclick: () => dialog.close(), autofocus: true }, t("close"))),
+    ...details(parcel, place));
+  dialog.showModal();
+}
+
+function details(parcel, place) {
   const figure = (key, value, unit, digits) => h("div", {}, h("dt", {}, t(`parcel.${key}`)), h("dd", {}, `${number(value, digits)} ${unit}`));
   const sized = (key) => h("div", {}, h("dt", {}, t(`parcel.${key}`)), h("dd", {}, `${number(parcel[`${key}_mm`])} ± ${number(parcel[`sigma_${key}_mm`], 2)} mm`));
-  dialog.replaceChildren(
-    h("div", { class: "bar" }, h("h2", { id: "dialog-title" }, t("parcel.title", { seq: parcel.seq })), verdict(parcel),
-      h("button", { type: "button", class: "end", onclick: () => dialog.close(), autofocus: true }, t("close"))),
-    parcel.picture ? h("p", {}, picture(parcel, path, true)) : h("p", { class: "soft" }, t("parcel.no_picture")),
+  return [
+    h("div", { class: "bar" }, h("h2", { id: "dialog-title" }, t("parcel.title", { seq: parcel.seq })), verdict(parcel)),
+    parcel.picture ? h("p", {}, picture(parcel, picturePath(place), true)) : h("p", { class: "soft" }, t("parcel.no_picture")),
     h("p", {}, doubts(parcel) || t("parcel.no_doubt")),
     h("dl", { class: "figures" },
       ...(parcel.not_measured === null ? ["length", "width", "height"].map(sized) : []),
       figure("yaw", parcel.yaw_deg, "°", 1), figure("x", parcel.x_mm, "mm", 1), figure("y", parcel.y_mm, "mm", 1),
       figure("speed", parcel.belt_speed_mm_per_s, "mm/s", 1), figure("travel", parcel.belt_travel_mm, "mm", 0),
       figure("frame", parcel.frame, "", 0), figure("t", parcel.t_s, "s", 2),
-      h("div", {}, h("dt", {}, t("parcel.time")), h("dd", {}, time(parcel.utc_ms)))));
-  dialog.showModal();
+      h("div", {}, h("dt", {}, t("parcel.time")), h("dd", {}, time(parcel.utc_ms)))),
+  ];
 }

@@ -1,41 +1,36 @@
-//! Entries as other programs read them.
+//! Parcel records as CSV, as other programs read them.
 
-use super::Stored;
 use serde_json::Value;
 use std::time::{Duration, SystemTime};
 
 /// The columns of a parcel's line, named as in its record.
-pub struct Columns;
+const NAMES: [&str; 21] = [
+    "seq",
+    "length_mm",
+    "width_mm",
+    "height_mm",
+    "sigma_length_mm",
+    "sigma_width_mm",
+    "sigma_height_mm",
+    "yaw_deg",
+    "x_mm",
+    "y_mm",
+    "shape",
+    "may_be_used",
+    "flags",
+    "not_measured",
+    "belt_speed_mm_per_s",
+    "belt_travel_mm",
+    "by_encoder",
+    "frame",
+    "t_s",
+    "boots",
+    "version",
+];
 
-impl Columns {
-    const NAMES: [&str; 21] = [
-        "seq",
-        "length_mm",
-        "width_mm",
-        "height_mm",
-        "sigma_length_mm",
-        "sigma_width_mm",
-        "sigma_height_mm",
-        "yaw_deg",
-        "x_mm",
-        "y_mm",
-        "shape",
-        "may_be_used",
-        "flags",
-        "not_measured",
-        "belt_speed_mm_per_s",
-        "belt_travel_mm",
-        "by_encoder",
-        "frame",
-        "t_s",
-        "boots",
-        "version",
-    ];
-
-    /// The line above them.
-    pub fn header() -> String {
-        format!("entry,utc,{}", Self::NAMES.join(","))
-    }
+/// The line above the others. `number`: what their first cell counts.
+pub fn header(number: &str) -> String {
+    format!("{number},utc,{}", NAMES.join(","))
 }
 
 /// A time as RFC 3339 has it, in UTC.
@@ -45,11 +40,10 @@ pub fn utc(utc_ms: u64) -> String {
     humantime::format_rfc3339_millis(SystemTime::UNIX_EPOCH + since_1970).to_string()
 }
 
-/// A parcel as a line of CSV; what its record lacks is empty.
-pub fn csv_line(stored: &Stored) -> String {
-    let record: Value = serde_json::from_str(&stored.entry.text).unwrap_or_default();
-    let mut line = format!("{},{}", stored.number, utc(stored.entry.utc_ms));
-    for name in Columns::NAMES {
+/// A record, as JSON has it, as a line; what it lacks is empty.
+pub fn line(number: u64, utc_ms: u64, record: &Value) -> String {
+    let mut line = format!("{number},{}", utc(utc_ms));
+    for name in NAMES {
         line.push(',');
         line.push_str(&cell(&record[name]));
     }
@@ -80,24 +74,17 @@ fn cell(value: &Value) -> String {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::archive::{Entry, Kind};
 
     #[test]
     fn a_line_has_a_cell_for_every_column_whatever_the_record_says() {
         let line = |text: &str| {
-            let entry = Entry {
-                kind: Kind::Parcel,
-                utc_ms: 1_795_000_000_123,
-                text: text.into(),
-                picture: vec![],
-            };
-            csv_line(&Stored { number: 3, entry })
+            line(3, 1_795_000_000_123, &serde_json::from_str(text).unwrap_or_default())
         };
         let whole =
             line(r#"{"seq":7,"length_mm":235.1,"flags":["merged","clipped"],"shape":"box"}"#);
         assert!(whole.starts_with("3,2026-11-18T"), "{whole}");
         assert!(whole.contains(",7,235.1,,") && whole.contains(",merged|clipped,"), "{whole}");
-        let columns = Columns::header().split(',').count();
+        let columns = header("entry").split(',').count();
         for text in ["", "null", "[1]", r#"{"seq":{"a":1}}"#] {
             assert_eq!(line(text).split(',').count(), columns, "{text}");
         }
