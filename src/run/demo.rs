@@ -100,7 +100,7 @@ fn introduction(
     let how_long = if seconds == 0.0 {
         "until Ctrl-C".to_owned()
     } else {
-        format!("for {seconds:.0} s; Ctrl-C ends it earlier")
+        format!("for {seconds:.0} s (Ctrl-C ends it earlier, with --seconds 0 it runs on)")
     };
     let stop = scenario.belt.stops.first().filter(|stop| seconds == 0.0 || stop.at_s < seconds);
     let stop = stop.map_or_else(String::new, |stop| {

@@ -7,8 +7,9 @@ import { parcel, parcels } from "./parcels.js";
 import { plc } from "./plc.js";
 
 const PAGES = { overview, parcels, plc, events };
-// Reached from the list.
+// One of a list is part of it.
 const OTHERS = { parcel };
+const LIST_OF = { parcel: "parcels" };
 const THEMES = ["auto", "light", "dark"];
 const element = (id) => document.getElementById(id);
 let leave = new AbortController();
@@ -41,7 +42,7 @@ function show() {
   leave = new AbortController();
   element("dialog").close();
   element("nav").replaceChildren(...Object.keys(PAGES).map((key) =>
-    h("a", { href: `#${key}`, "aria-current": key === page ? "page" : null }, t(`page.${key}`))));
+    h("a", { href: `#${key}`, "aria-current": key === (LIST_OF[page] ?? page) ? "page" : null }, t(`page.${key}`))));
   document.title = `Beltgauge – ${t(`page.${page}`)}`;
   element("language").textContent = t("language.other");
   element("language").lang = otherLanguage();
