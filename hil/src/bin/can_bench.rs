@@ -66,17 +66,21 @@ fn receive(interface: &str, parcels: usize) {
             _ => {}
         }
         if receiver.whole.len() > whole {
+            println!("parcel {}", receiver.whole.last().expect("more than before")["sequence"]);
             (whole, last) = (receiver.whole.len(), Instant::now());
         }
     }
-    let wrong = receiver.whole.iter().zip(1..).filter(|(values, number)| {
+    let wrong = receiver.whole.iter().filter(|values| {
         let expected = record(values["sequence"]);
-        values["sequence"] != *number
-            || values["length"] != (10.0 * expected.length_mm).round() as u32
+        values["length"] != (10.0 * expected.length_mm).round() as u32
             || values["width"] != (10.0 * expected.width_mm).round() as u32
     });
+    let came = |number: &u32| receiver.whole.iter().any(|values| values["sequence"] == *number);
+    let missing: Vec<u32> = (1..=parcels as u32).filter(|number| !came(number)).collect();
+    let in_order = receiver.whole.is_sorted_by_key(|values| values["sequence"]);
     println!(
-        "whole {} wrong {} repeated {} broken {} heartbeats {} errors {errors}",
+        "whole {} wrong {} repeated {} broken {} heartbeats {} errors {errors} in order {in_order} \
+         missing {missing:?}",
         receiver.whole.len(),
         wrong.count(),
         receiver.repeated,
