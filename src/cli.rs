@@ -64,6 +64,9 @@ pub enum Command {
         /// Address and port of the Modbus server [default: 0.0.0.0:1502].
         #[arg(long, value_name = "ADDRESS:PORT", help_heading = BELT)]
         listen: Option<SocketAddr>,
+        /// Address and port of the page [default: 127.0.0.1:8080, for this computer alone].
+        #[arg(long, value_name = "ADDRESS:PORT", help_heading = BELT)]
+        page: Option<SocketAddr>,
         /// Folder for the table, the records and the annotated pictures.
         #[arg(long, value_name = "DIR", default_value = "demo-out", help_heading = RESULTS)]
         out: PathBuf,
@@ -124,6 +127,14 @@ pub enum Command {
         #[arg(long, conflicts_with_all = ["file", "config", "store"])]
         schema: bool,
     },
+    /// What was seen: parcels with their pictures, and events.
+    Archive {
+        #[command(subcommand)]
+        what: Archive,
+        /// The archive's folder [default: that of an appliance].
+        #[arg(long, global = true, value_name = "DIR", help_heading = INPUT)]
+        folder: Option<PathBuf>,
+    },
     /// Do what inserting a USB stick does: put its configuration in force.
     Import {
         /// The stick: a folder with a folder `beltgauge` in it.
@@ -174,7 +185,7 @@ pub enum Command {
 }
 
 /// Where an appliance keeps its configurations.
-const STORE: &str = "/var/lib/beltgauge";
+pub const STORE: &str = "/var/lib/beltgauge";
 
 /// Which configuration.
 #[derive(clap::Args)]
@@ -195,6 +206,30 @@ impl ConfigFile {
     pub fn path(&self) -> Option<&Path> {
         self.file.as_deref().or(self.config.as_deref())
     }
+}
+
+#[derive(Subcommand)]
+pub enum Archive {
+    /// Print the last entries, newest first.
+    List {
+        /// How many.
+        #[arg(long, default_value_t = 20, help_heading = INPUT)]
+        last: usize,
+    },
+    /// Write all entries for other programs.
+    Export {
+        /// Parcels, a line each.
+        #[arg(long, value_name = "FILE", help_heading = RESULTS)]
+        csv: Option<PathBuf>,
+        /// All entries, a line of JSON each.
+        #[arg(long, value_name = "FILE", help_heading = RESULTS)]
+        jsonl: Option<PathBuf>,
+        /// Folder for the pictures, named by the numbers of their entries.
+        #[arg(long, value_name = "DIR", help_heading = RESULTS)]
+        pictures: Option<PathBuf>,
+    },
+    /// Say whether it is as it was written.
+    Verify,
 }
 
 #[derive(clap::Args)]

@@ -1,5 +1,7 @@
 //! What leaves the pipeline: parcel records and counters.
 
+pub mod csv;
+
 use serde::de::{Deserializer, Error as _};
 use serde::ser::{SerializeSeq, Serializer};
 use std::fmt;

@@ -16,15 +16,16 @@
 //! - [`sandbox`]: child processes for what strangers bring.
 //! - [`source`]: where frames come from, and what records them. [`plc`]: how records reach the PLC.
 //! - [`store`]: the appliance's disk: configurations in force, sticks, whom it trusts.
-//! - [`run`]: threads and rings; the only room that knows source, pipeline, plc and store.
+//! - [`archive`]: parcels with pictures, and events, on the disk. [`web`]: the page that shows all this.
+//! - [`run`]: threads and rings; the only room that knows source, pipeline, plc, store, archive and web.
 //!
 //! Invariants: `pipeline::step` reads no clock and allocates nothing; every parcel is told once, also
 //! over frames that are missing (`pipeline/gap.rs` says how); dependencies point one way
 //! (`tests/tidy.rs` checks it).
 //!
-//! Deliberately absent: a framework, plug-ins, a user interface, learning from data, any
-//! claim of legal metrology.
+//! Deliberately absent: a framework, plug-ins, learning from data, any claim of legal metrology.
 
+pub mod archive;
 pub mod belt;
 pub mod camera;
 pub mod config;
@@ -41,6 +42,7 @@ pub mod source;
 pub mod stage;
 pub mod store;
 pub mod units;
+pub mod web;
 
 /// What `hil/fuzz` feeds with any bytes, and nobody else calls from outside.
 #[doc(hidden)]

@@ -7,6 +7,7 @@ use beltgauge::camera::chessboard::Chessboard;
 use beltgauge::config::{self, Site};
 use beltgauge::error::{Error, Result};
 use beltgauge::event::ParcelRecord;
+use beltgauge::run::archive::{self, Export};
 use beltgauge::run::board;
 use beltgauge::run::budget::{self, StraightDown};
 use beltgauge::run::calibrate::{self, DataSheet};
@@ -17,7 +18,7 @@ use beltgauge::source::{FaultInjector, Faults};
 use beltgauge::store::{Store, manifest};
 use beltgauge::{run, source};
 use clap::{CommandFactory, Parser};
-use cli::{Budget, Calibrate, Cli, Command, Model};
+use cli::{Archive, Budget, Calibrate, Cli, Command, Model, STORE};
 use std::io::{IsTerminal, Write};
 use std::path::Path;
 use std::process::ExitCode;
@@ -87,9 +88,10 @@ impl Observer for Console {
 
 fn dispatch(command: Command) -> Result<()> {
     match command {
-        Command::Demo { seconds, out, listen, config, record } => {
+        Command::Demo { seconds, out, listen, page, config, record } => {
             let (config, record) = (config.as_deref(), record.as_deref());
-            let table = demo::run(demo::Options { seconds, out: &out, listen, config, record })?;
+            let options = demo::Options { seconds, out: &out, listen, page, config, record };
+            let table = demo::run(options)?;
             print(format_args!("{table}\npictures and records are in {}", out.display()))
         }
         Command::Measure { input, config, fps, jsonl, annotate, explain, inject } => {
@@ -121,6 +123,19 @@ fn dispatch(command: Command) -> Result<()> {
             watchdog: watchdog.as_deref(),
             record: record.as_deref(),
         }),
+        Command::Archive { what, folder } => {
+            let folder = folder.unwrap_or_else(|| Store::new(Path::new(STORE)).archive());
+            let report = match what {
+                Archive::List { last } => archive::list(&folder, last)?,
+                Archive::Export { csv, jsonl, pictures } => {
+                    let (csv, jsonl) = (csv.as_deref(), jsonl.as_deref());
+                    let pictures = pictures.as_deref();
+                    archive::export(&folder, Export { csv, jsonl, pictures })?
+                }
+                Archive::Verify => archive::verify(&folder)?,
+            };
+            print(format_args!("{}", report.trim_end()))
+        }
         Command::Import { dir, store, .. } => {
             let store = Store::new(&store);
             let report = match dir {

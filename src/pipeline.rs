@@ -7,8 +7,10 @@
 mod gap;
 mod motion;
 mod records;
+mod sight;
 
 pub use motion::Health;
+pub use sight::Sight;
 
 use crate::belt::BeltPosition;
 use crate::config::Site;

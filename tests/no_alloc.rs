@@ -3,6 +3,7 @@
 
 mod common;
 
+use beltgauge::archive::Reader;
 use beltgauge::config::{Config, Site};
 use beltgauge::error::Result;
 use beltgauge::image::FrameTime;
@@ -10,6 +11,8 @@ use beltgauge::run::{Appliance, demo};
 use beltgauge::source::synthetic::{Scenario, Synthetic};
 use beltgauge::source::{FrameSource, Pace, Paced};
 use std::alloc::{GlobalAlloc, Layout, System};
+use std::io::{Read, Write};
+use std::net::{SocketAddr, TcpStream};
 use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
 
 /// Allocations on the threads named capture and vision while armed.
@@ -105,20 +108,58 @@ fn resident_kib() -> u64 {
     line.split_whitespace().nth(1).and_then(|kib| kib.parse().ok()).expect("a number")
 }
 
-/// Run the appliance over a source; returns parcels and allocations on both threads.
-fn run(source: &mut Watched, mut site: Site, workers: usize) -> (u64, u64, u64) {
-    CAPTURE.store(0, Ordering::Relaxed);
-    VISION.store(0, Ordering::Relaxed);
+/// Live pictures that the viewers of [`run`] have got.
+static PICTURES: AtomicU64 = AtomicU64::new(0);
+
+/// Run the appliance over a source, so many looking at its page; returns parcels and allocations on both
+/// threads.
+fn run(source: &mut Watched, mut site: Site, workers: usize, viewers: usize) -> (u64, u64, u64) {
+    for counter in [&CAPTURE, &VISION, &PICTURES] {
+        counter.store(0, Ordering::Relaxed);
+    }
     site.config.realtime.workers = workers;
-    site.config.modbus.listen = ([127, 0, 0, 1], 0).into();
+    let anywhere = SocketAddr::from(([127, 0, 0, 1], 0));
+    site.config.modbus.listen = anywhere;
+    (site.config.web.address, site.config.web.port) = (anywhere.ip(), anywhere.port());
+    let web = site.config.web.enabled;
     let appliance = Appliance::new(site).expect("port 0 is free");
-    let progress = appliance.run(&mut Paced::new(source, Pace::Unhurried), |_, records| {
-        records.for_each(drop);
-        true
+    let page = appliance.page_address();
+    assert_eq!(page.is_some(), web, "port 0 is free");
+    let over = AtomicBool::new(false);
+    let progress = std::thread::scope(|scope| {
+        for (page, viewer) in page.into_iter().flat_map(|page| (0..viewers).map(move |i| (page, i)))
+        {
+            let view = ["belt", "raw"][viewer % 2];
+            let over = &over;
+            scope.spawn(move || look(page, view, over));
+        }
+        let progress = appliance.run(&mut Paced::new(source, Pace::Unhurried), |_, records| {
+            records.for_each(drop);
+            true
+        });
+        over.store(true, Ordering::Relaxed);
+        progress
     });
     ARMED.store(false, Ordering::Relaxed);
     let parcels = progress.expect("runs to the end").status.counters.parcels;
     (parcels, CAPTURE.load(Ordering::Relaxed), VISION.load(Ordering::Relaxed))
+}
+
+/// Pull live pictures, one after the other.
+fn look(page: SocketAddr, view: &str, over: &AtomicBool) {
+    while !over.load(Ordering::Relaxed) {
+        let Ok(mut stream) = TcpStream::connect(page) else { return };
+        let request = format!(
+            "GET /api/live/{view} HTTP/1.1\r\nHost: localhost\r\nConnection: close\r\n\r\n"
+        );
+        let mut answer = Vec::new();
+        let asked = stream.write_all(request.as_bytes());
+        if asked.and_then(|()| stream.read_to_end(&mut answer)).is_ok()
+            && answer.starts_with(b"HTTP/1.1 200")
+        {
+            PICTURES.fetch_add(1, Ordering::Relaxed);
+        }
+    }
 }
 
 /// The demo's belt and site.
@@ -155,16 +196,18 @@ fn ten_thousand_frames_with_parcels_allocate_nothing_and_memory_stays_as_it_was_
     belt.render(0, &mut vec![0; 1920 * 1200]);
     let renderer_kib = resident_kib() - base_kib;
     let mut source = Watched::new(belt, 90);
-    let (_, capture, vision) = run(&mut source, site, 1);
+    let (_, capture, vision) = run(&mut source, site, 1, 0);
     assert_eq!((capture, vision), (0, 0), "allocations at the full size");
     let appliance_kib = source.resident_kib[1] - renderer_kib;
     eprintln!("resident at 1920x1200: {appliance_kib} KiB besides the renderer's {renderer_kib}");
     assert!(appliance_kib * 1024 < 64_000_000, "{appliance_kib} KiB");
     drop(source);
 
-    let (belt, site) = long_belt(320, 10_100);
+    let (belt, mut site) = long_belt(320, 10_100);
+    // The page's list of the last parcels fills up to its limit: that is none of these threads' memory.
+    site.config.web.enabled = false;
     let mut source = Watched::new(belt, 10_010);
-    let (parcels, capture, vision) = run(&mut source, site, 1);
+    let (parcels, capture, vision) = run(&mut source, site, 1, 0);
     assert!(parcels >= 300, "only {parcels} parcels passed: the test proves nothing");
     assert_eq!((capture, vision), (0, 0), "allocations on the capture and vision threads");
     let [early_kib, late_kib] = source.resident_kib;
@@ -172,14 +215,21 @@ fn ten_thousand_frames_with_parcels_allocate_nothing_and_memory_stays_as_it_was_
     // A page or two of stack that was not touched before; 16 bytes a frame would be 140 KiB.
     assert!(late_kib <= early_kib + 64, "grew from {early_kib} to {late_kib} KiB");
 
-    // Two workers: the threads are called "vision 0" and "vision 1".
-    let (belt, site) = demo_belt();
-    let (parcels, capture, vision) = run(&mut Watched::new(belt, 510), site, 2);
+    // Eight viewers of both pictures, and two workers: the threads are called "vision 0" and "vision 1".
+    let (belt, mut site) = demo_belt();
+    let archive = std::env::temp_dir().join(format!("beltgauge-no-alloc-{}", std::process::id()));
+    site.config.archive.folder = Some(archive.clone());
+    let (parcels, capture, vision) = run(&mut Watched::new(belt, 510), site, 2, 8);
+    let kept = Reader::open(&archive).and_then(|reader| reader.verify()).expect("an archive");
+    assert!(kept.entries >= parcels && kept.broken.is_empty(), "{kept:?}");
+    let _ = std::fs::remove_dir_all(&archive);
     assert!(parcels >= 5, "only {parcels} parcels passed with two workers");
-    assert_eq!((capture, vision), (0, 0), "allocations with two workers");
+    assert_eq!((capture, vision), (0, 0), "allocations with two workers and eight viewers");
+    let pictures = PICTURES.load(Ordering::Relaxed);
+    assert!(pictures >= 16, "the viewers got only {pictures} pictures: the test proves nothing");
     // The counter counts: one allocation and one release a frame while armed.
     let (belt, site) = demo_belt();
     let mut leaking = Watched { leak: true, ..Watched::new(belt, 510) };
-    let (_, capture, _) = run(&mut leaking, site, 1);
+    let (_, capture, _) = run(&mut leaking, site, 1, 0);
     assert!(capture >= 500, "the counter saw only {capture} planted allocations");
 }

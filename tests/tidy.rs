@@ -26,6 +26,8 @@ const MAY_USE: &[(&str, &[&str])] = &[
     ("source", &["camera", "config", "plan", "sandbox", "image", "units", "error"]),
     ("plc", &["config", "event", "error"]),
     ("store", &["camera", "config", "error"]),
+    ("archive", &["error"]),
+    ("web", &["config", "event", "error"]),
 ];
 
 /// The only places for `unsafe`.

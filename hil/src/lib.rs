@@ -3,6 +3,7 @@
 
 pub mod allocations;
 pub mod appliance;
+pub mod browser;
 pub mod can_peer;
 pub mod machine;
 #[cfg(feature = "opencv")]
@@ -49,6 +50,8 @@ pub struct Demo {
     child: Child,
     /// Where its Modbus server listens.
     pub address: SocketAddr,
+    /// Where its page is served.
+    pub page: SocketAddr,
     /// Its output folder.
     pub out: PathBuf,
 }
@@ -60,8 +63,8 @@ impl Demo {
     /// When it does not start or its server does not answer.
     pub fn start(name: &str, seconds: u32, pin: bool) -> Self {
         let binary = beltgauge();
-        let free = TcpListener::bind("127.0.0.1:0").expect("a free port");
-        let address = free.local_addr().expect("bound");
+        let free = [(); 2].map(|()| TcpListener::bind("127.0.0.1:0").expect("a free port"));
+        let [address, page] = free.each_ref().map(|socket| socket.local_addr().expect("bound"));
         drop(free);
         let out = project().join("target/hil-out").join(name);
         let _ = std::fs::remove_dir_all(&out);
@@ -79,6 +82,8 @@ impl Demo {
                 &seconds.to_string(),
                 "--listen",
                 &address.to_string(),
+                "--page",
+                &page.to_string(),
                 "--out",
             ])
             .arg(&out)
@@ -86,7 +91,7 @@ impl Demo {
             .stderr(Stdio::null())
             .spawn()
             .expect("the demo starts");
-        let mut demo = Self { child, address, out };
+        let mut demo = Self { child, address, page, out };
         wait_for("the Modbus server", || {
             assert!(demo.child.try_wait().expect("a child").is_none(), "the demo ended early");
             TcpStream::connect(address).ok()

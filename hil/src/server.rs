@@ -3,6 +3,7 @@
 use beltgauge::config::{Can, Modbus, Plc as Settings};
 use beltgauge::event::{Flags, ParcelRecord, Shape};
 use beltgauge::plc::can::CanLink;
+use beltgauge::plc::clients::ClientList;
 use beltgauge::plc::journal::Journal;
 use beltgauge::plc::link::Link;
 use beltgauge::plc::modbus;
@@ -56,7 +57,8 @@ impl Server {
             let link = Link::new(plc, settings.word_order, sends, journal, Instant::now());
             let mut can = CanLink::<CanFdSocket>::new(can, Instant::now());
             let mut vision = VisionStatus { ready: true, ..VisionStatus::default() };
-            let served = modbus::serve(listener, &settings, link, |link| {
+            let clients = ClientList::new(settings.connections_max);
+            let served = modbus::serve(listener, &settings, clients, link, |link| {
                 vision.counters.frames += 1;
                 while let Ok(record) = incoming.try_recv() {
                     link.record(record, 0.0);

@@ -5,6 +5,7 @@ mod json_schema;
 mod plc;
 mod ranges;
 mod schema;
+mod service;
 
 pub use json_schema::json_schema;
 pub use plc::{Can, DimensionOrder, Encoder, Modbus, Plc, WordOrder};
@@ -12,6 +13,7 @@ pub use schema::{
     Background, CameraTable, Config, Import, Interface, Limits, Measure, Odometry, Realtime,
     Segment, View, public_key,
 };
+pub use service::{Archive, Web};
 
 use crate::camera::{BeltView, Camera, CameraFile};
 use crate::error::{Error, Result};
@@ -51,7 +53,8 @@ impl Site {
     /// Files that the configuration names are beside it.
     pub fn beside(&mut self, path: &Path) {
         let folder = path.parent().unwrap_or(Path::new("."));
-        if let Some(file) = &mut self.config.plc.state_file {
+        let named = [&mut self.config.plc.state_file, &mut self.config.archive.folder];
+        for file in named.into_iter().flatten() {
             *file = folder.join(&*file);
         }
     }

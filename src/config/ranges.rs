@@ -51,6 +51,9 @@ pub(super) const RANGES: &[Range] = &[
     ("can.bitrate", 10_000.0, 1_000_000.0, ""),
     ("can.data_bitrate", 10_000.0, 8_000_000.0, ""),
     ("encoder.bits", 8.0, 32.0, ""),
+    ("web.connections_max", 8.0, 1024.0, ""),
+    ("web.pictures_per_s_max", 1.0, 60.0, ""),
+    ("archive.mib_max", 16.0, 1_048_576.0, ""),
     ("encoder.timeout_s", 0.02, 10.0, "s"),
 ];
 

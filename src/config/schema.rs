@@ -2,6 +2,7 @@
 
 use super::plc::{Can, Encoder, Modbus, Plc};
 use super::ranges::{self, range};
+use super::service::{Archive, Web};
 use crate::error::{Error, Result};
 use crate::units::BeltRect;
 use minisign_verify::PublicKey;
@@ -55,6 +56,12 @@ pub struct Config {
     /// `[import]`
     #[serde(default)]
     pub import: Import,
+    /// `[web]`
+    #[serde(default)]
+    pub web: Web,
+    /// `[archive]`
+    #[serde(default)]
+    pub archive: Archive,
 }
 
 /// How a live camera is reached.
@@ -317,7 +324,7 @@ impl Config {
 
     /// What the table of ranges cannot say.
     fn check(&self) -> Result<()> {
-        let Self { camera, zone, plc, modbus, can, encoder, import, .. } = self;
+        let Self { camera, zone, plc, modbus, can, encoder, import, web, .. } = self;
         camera.check()?;
         for (key, mm) in [
             ("zone.x_max_mm - zone.x_min_mm", zone.x_max_mm - zone.x_min_mm),
@@ -329,6 +336,7 @@ impl Config {
         can.check()?;
         encoder.check()?;
         check_writers(plc, modbus, can, encoder)?;
+        web.check()?;
         import.public_key.as_deref().map_or(Ok(()), |key| public_key(key).map(drop))
     }
 }

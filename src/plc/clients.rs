@@ -1,8 +1,8 @@
 //! Who stays connected when there are too many: those who have asked properly, before strangers.
 
-use std::sync::Arc;
-use std::sync::OnceLock;
+use std::net::SocketAddr;
 use std::sync::atomic::{AtomicU32, AtomicU64, Ordering};
+use std::sync::{Arc, Mutex, MutexGuard, OnceLock, PoisonError};
 use std::time::Instant;
 use tokio::task::AbortHandle;
 
@@ -18,6 +18,7 @@ pub(super) struct Asked {
     last_ms: AtomicU64,
     /// It is named in the configuration as one that writes: the PLC itself.
     may_write: bool,
+    address: Option<SocketAddr>,
 }
 
 /// Time counts from the first client on.
@@ -31,6 +32,11 @@ impl Asked {
     /// Nothing yet.
     pub(super) fn new(may_write: bool) -> Self {
         Self { may_write, ..Self::default() }
+    }
+
+    /// By a client with an address.
+    pub(super) fn from(self, address: SocketAddr) -> Self {
+        Self { address: Some(address), ..self }
     }
 
     /// It has sent a whole request. Whether that was its first.
@@ -48,6 +54,51 @@ impl Asked {
     fn standing(&self) -> (bool, u32, u64) {
         let requests = self.requests.load(Ordering::Relaxed).min(2);
         (self.may_write, requests, self.last_ms.load(Ordering::Relaxed))
+    }
+}
+
+/// A connected client, for those who watch.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Client {
+    /// Address and port.
+    pub address: SocketAddr,
+    /// Whole requests so far.
+    pub requests: u32,
+    /// Since the last one, or since it came.
+    pub silent_s: f64,
+    /// It may write.
+    pub may_write: bool,
+}
+
+/// The list of connected clients, to be looked at from elsewhere.
+#[derive(Clone, Debug)]
+pub struct ClientList(Arc<Mutex<Clients>>);
+
+impl ClientList {
+    /// Room for so many that ask.
+    pub fn new(max: usize) -> Self {
+        Self(Arc::new(Mutex::new(Clients::new(max))))
+    }
+
+    pub(super) fn lock(&self) -> MutexGuard<'_, Clients> {
+        self.0.lock().unwrap_or_else(PoisonError::into_inner)
+    }
+
+    /// Those that are connected.
+    pub fn connected(&self) -> Vec<Client> {
+        let now_ms = now_ms();
+        let clients = self.lock();
+        let alive = clients.connected.iter().filter(|(_, connection)| !connection.is_finished());
+        let client = |asked: &Asked| {
+            let silent_ms = now_ms.saturating_sub(asked.last_ms.load(Ordering::Relaxed));
+            Some(Client {
+                address: asked.address?,
+                requests: asked.requests.load(Ordering::Relaxed),
+                silent_s: silent_ms as f64 / 1e3,
+                may_write: asked.may_write,
+            })
+        };
+        alive.filter_map(|(asked, _)| client(asked)).collect()
     }
 }
 

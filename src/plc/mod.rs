@@ -2,7 +2,7 @@
 
 pub mod bus;
 pub mod can;
-mod clients;
+pub mod clients;
 pub mod command;
 pub mod dbc;
 pub mod document;
@@ -16,7 +16,7 @@ pub mod modbus;
 mod present;
 pub mod registers;
 pub mod structured_text;
-mod table;
+pub mod table;
 
 /// A record for tests.
 #[cfg(test)]

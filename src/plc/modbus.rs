@@ -5,7 +5,7 @@
 //! answered when the disk has what it changed. Runs on its own thread; nothing here can block the
 //! vision thread.
 
-use super::clients::{Asked, Clients};
+use super::clients::{Asked, ClientList};
 use super::command::Sender;
 use super::guard;
 use super::link::{Link, Refusal};
@@ -55,6 +55,7 @@ pub fn bind(settings: &Settings) -> Result<TcpListener> {
 pub fn serve(
     listener: TcpListener,
     settings: &Settings,
+    clients: ClientList,
     link: Link,
     mut visit: impl FnMut(&mut Link) -> bool,
 ) -> Result<()> {
@@ -64,7 +65,7 @@ pub fn serve(
     runtime.block_on(async {
         let link: SharedLink = Arc::new(Mutex::new(link));
         let listener = tokio::net::TcpListener::from_std(listener).map_err(failed)?;
-        tokio::spawn(accept(listener, settings.clone(), Arc::clone(&link)));
+        tokio::spawn(accept(listener, settings.clone(), clients, Arc::clone(&link)));
         let mut ticks = tokio::time::interval(UPDATE_PERIOD);
         ticks.set_missed_tick_behavior(tokio::time::MissedTickBehavior::Delay);
         loop {
@@ -78,9 +79,13 @@ pub fn serve(
 }
 
 /// Accept clients for ever; a failing listener is tried again.
-async fn accept(listener: tokio::net::TcpListener, settings: Settings, link: SharedLink) {
+async fn accept(
+    listener: tokio::net::TcpListener,
+    settings: Settings,
+    clients: ClientList,
+    link: SharedLink,
+) {
     let server = tokio_modbus::server::tcp::Server::new(listener);
-    let clients = Arc::new(Mutex::new(Clients::new(settings.connections_max)));
     let connects = Arc::new(Mutex::new(LogLimit::default()));
     let refused_writes = Arc::new(Mutex::new(LogLimit::default()));
     let on_connected = |stream: TcpStream, address: SocketAddr| {
@@ -99,12 +104,13 @@ async fn accept(listener: tokio::net::TcpListener, settings: Settings, link: Sha
             refused_writes: Arc::clone(&refused_writes),
         };
         let (library_end, guard_end) = tokio::io::duplex(PIPE_BYTES);
-        let asked = Arc::new(Asked::new(may_write(&settings.write_allow, address.ip())));
+        let asked = Asked::new(may_write(&settings.write_allow, address.ip())).from(address);
+        let asked = Arc::new(asked);
         let note_request = {
-            let (asked, clients) = (Arc::clone(&asked), Arc::clone(&clients));
+            let (asked, clients) = (Arc::clone(&asked), clients.clone());
             move || {
                 if asked.note() {
-                    lock(&clients).has_asked(&asked);
+                    clients.lock().has_asked(&asked);
                 }
             }
         };
@@ -118,7 +124,7 @@ async fn accept(listener: tokio::net::TcpListener, settings: Settings, link: Sha
             }
         });
         if allowed {
-            lock(&clients).admit(asked, connection.abort_handle());
+            clients.lock().admit(asked, connection.abort_handle());
         }
         async move { Ok(Some((registers, library_end))) }
     };

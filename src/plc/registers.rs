@@ -250,7 +250,11 @@ impl Status {
 
     /// Code of what matters most: see [`REASONS`].
     pub fn reason(&self) -> u16 {
-        // Most important first; what was, comes after what is.
+        self.reasons().next().unwrap_or(0)
+    }
+
+    /// Codes of all that holds, most important first; what was, comes after what is.
+    pub fn reasons(&self) -> impl Iterator<Item = u16> + use<> {
         let holds = [
             (1, self.vision.source_ended),
             (12, self.vision.camera_absent),
@@ -271,7 +275,7 @@ impl Status {
             (10, self.queue_overflows > 0),
             (11, self.overflows() > 0),
         ];
-        holds.iter().find(|(_, holds)| *holds).map_or(0, |(code, _)| *code)
+        holds.into_iter().filter(|(_, holds)| *holds).map(|(code, _)| code)
     }
 }
 
@@ -530,6 +534,7 @@ mod tests {
         assert_eq!(status.reason(), 6);
         status.can.state = CanState::BusOff;
         assert_eq!(status.reason(), 3);
+        assert!(status.reasons().eq([3, 6, 11]));
         let codes = REASONS.iter().map(|(code, _)| *code);
         assert!(codes.eq(0..19));
     }

@@ -19,6 +19,9 @@ const SCENARIO: &str = include_str!("../../config/demo/scenario.toml");
 const CONFIG: &str = include_str!("../../config/demo/beltgauge.toml");
 /// The recording in the folder of `--record`.
 const RECORDING: &str = "recording.y4m";
+/// Folder of the archive in that of the results, and what it may take of the disk.
+const ARCHIVE: &str = "archive";
+const ARCHIVE_MIB_MAX: usize = 256;
 /// The longest time that makes sense.
 const SECONDS_MAX: f64 = 1e6;
 /// The console line is renewed this often.
@@ -33,6 +36,8 @@ pub struct Options<'a> {
     pub out: &'a Path,
     /// Where the Modbus server listens; default: the demo configuration's port 1502.
     pub listen: Option<SocketAddr>,
+    /// Where the page is served; default: the demo configuration's 127.0.0.1:8080.
+    pub page: Option<SocketAddr>,
     /// File with other tables of a configuration, for example `[can]`.
     pub config: Option<&'a Path>,
     /// Folder for a recording, and all that measuring it again and calibrating its camera needs.
@@ -63,6 +68,10 @@ fn site_with(scenario: &Scenario, path: &Path) -> Result<Site> {
     if let Some(toml::Value::Table(modbus)) = tables.get_mut("modbus") {
         modbus.entry("write_allow").or_insert_with(|| toml::Value::Array(vec!["0.0.0.0".into()]));
     }
+    // Who wants others to look says so.
+    if let Some(toml::Value::Table(web)) = tables.get_mut("web") {
+        web.entry("address").or_insert_with(|| "127.0.0.1".into());
+    }
     let config = Config::parse(&tables.to_string()).map_err(|e| e.in_file(path))?;
     let mut site = Site::new(config, scenario.camera()?).map_err(|e| e.in_file(path))?;
     site.beside(path);
@@ -81,11 +90,17 @@ fn until_told() -> Result<Arc<AtomicBool>> {
 }
 
 /// What will happen, for whoever has just started it.
-fn introduction(scenario: &Scenario, seconds: f64, listen: SocketAddr, out: &Path) -> String {
+fn introduction(
+    scenario: &Scenario,
+    seconds: f64,
+    page: &str,
+    modbus: SocketAddr,
+    out: &Path,
+) -> String {
     let how_long = if seconds == 0.0 {
         "until Ctrl-C".to_owned()
     } else {
-        format!("for {seconds:.0} s; Ctrl-C ends it earlier")
+        format!("for {seconds:.0} s (Ctrl-C ends it earlier, with --seconds 0 it runs on)")
     };
     let stop = scenario.belt.stops.first().filter(|stop| seconds == 0.0 || stop.at_s < seconds);
     let stop = stop.map_or_else(String::new, |stop| {
@@ -97,10 +112,11 @@ fn introduction(scenario: &Scenario, seconds: f64, listen: SocketAddr, out: &Pat
         )
     });
     format!(
-        "Demo: the whole appliance on a synthetic belt, {how_long}. No camera and no PLC are needed.\n\
+        "{page}\n\
+         Demo: the whole appliance on a synthetic belt, {how_long}. No camera and no PLC are needed.\n\
          Parcels come after 2 s. Their true sizes are known, but not to the appliance.\n{stop}\
          At the end there is a table of true and measured sizes, here and in {}.\n\
-         A PLC, or any Modbus client, can read the parcels on {listen}: see config/REGISTERS.md.\n",
+         A PLC, or any Modbus client, can read the parcels on {modbus}: see config/REGISTERS.md.\n",
         out.display()
     )
 }
@@ -125,7 +141,16 @@ pub fn run(options: Options<'_>) -> Result<String> {
     if let Some(listen) = options.listen {
         site.config.modbus.listen = listen;
     }
+    if let Some(page) = options.page {
+        (site.config.web.address, site.config.web.port) = (page.ip(), page.port());
+    }
+    let archive = &mut site.config.archive;
+    if archive.folder.is_none() {
+        (archive.folder, archive.mib_max) = (Some(options.out.join(ARCHIVE)), ARCHIVE_MIB_MAX);
+    }
     let listen = site.config.modbus.listen;
+    let web = &site.config.web;
+    let web = web.enabled.then(|| SocketAddr::new(web.address, web.port));
     let camera = site.camera.clone();
     let failed = |e: std::io::Error| {
         Error::failure(format!("cannot write the results: {e}")).in_file(options.out)
@@ -139,6 +164,7 @@ pub fn run(options: Options<'_>) -> Result<String> {
         Some(_) => memory::room_for_recorder(&site)?,
     };
     let appliance = Appliance::new(site)?;
+    let page = page_words(appliance.page_address(), web);
     let mut paced = Paced::new(&mut source, Pace::RealTime);
     let mut recorder = None;
     let feed: &mut dyn Feed = match options.record {
@@ -152,7 +178,7 @@ pub fn run(options: Options<'_>) -> Result<String> {
             recorder
         }
     };
-    let text = introduction(&scenario, options.seconds, listen, options.out);
+    let text = introduction(&scenario, options.seconds, &page, listen, options.out);
     log::say(format_args!("{text}"));
     let (start, mut shown) = (Instant::now(), Instant::now());
     let progress = appliance.run(feed, |progress, new| {
@@ -181,6 +207,28 @@ pub fn run(options: Options<'_>) -> Result<String> {
     Ok(table)
 }
 
+/// Where to see it, first of all. `wanted`: where it should be; none: nowhere.
+fn page_words(served: Option<SocketAddr>, wanted: Option<SocketAddr>) -> String {
+    match (served, wanted) {
+        (Some(page), _) => format!("See it in a browser: {}", page_url(page)),
+        (None, Some(wanted)) => format!(
+            "There is no page in the browser: {wanted} is taken, or is no address of this computer. \
+             It is tried again; or choose another one, for example --page 127.0.0.1:8090"
+        ),
+        (None, None) => "There is no page in the browser: web.enabled = false.".to_owned(),
+    }
+}
+
+/// What to type into a browser on this machine.
+fn page_url(page: SocketAddr) -> String {
+    let [v4, v6] = ["127.0.0.1", "[::1]"];
+    match page {
+        SocketAddr::V4(at) if at.ip().is_unspecified() => format!("http://{v4}:{}/", at.port()),
+        SocketAddr::V6(at) if at.ip().is_unspecified() => format!("http://{v6}:{}/", at.port()),
+        at => format!("http://{at}/"),
+    }
+}
+
 fn console(progress: &Progress, elapsed: Duration, last: Option<&ParcelRecord>) {
     let status = &progress.status;
     let latest = last.map_or_else(String::new, |r| {
@@ -199,4 +247,41 @@ fn console(progress: &Progress, elapsed: Duration, last: Option<&ParcelRecord>) 
         status.counters.parcels,
     );
     log::say(format_args!("\r{line:100}"));
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn the_page_is_told_first_and_shown_to_this_computer_alone() {
+        let scenario = scenario().expect("committed");
+        let web = site(&scenario).expect("valid").config.web;
+        assert!(web.enabled && web.address.is_loopback());
+        let page = SocketAddr::new(web.address, web.port);
+        let words = page_words(Some(page), Some(page));
+        let text = introduction(&scenario, 30.0, &words, page, Path::new("out"));
+        assert!(text.starts_with("See it in a browser: http://127.0.0.1:8080/\n"), "{text}");
+        let taken = page_words(None, Some(page));
+        assert!(taken.contains("127.0.0.1:8080 is taken") && taken.contains("--page"), "{taken}");
+        for (served, shown) in [
+            ("0.0.0.0:81", "http://127.0.0.1:81/"),
+            ("[::]:81", "http://[::1]:81/"),
+            ("10.0.0.7:81", "http://10.0.0.7:81/"),
+        ] {
+            assert_eq!(page_url(served.parse().expect("an address")), shown);
+        }
+    }
+
+    #[test]
+    fn tables_of_a_file_do_not_show_the_page_to_others_by_omission() {
+        let file = std::env::temp_dir().join(format!("beltgauge-demo-{}.toml", std::process::id()));
+        let address = |text: &str| {
+            std::fs::write(&file, text).expect("room");
+            site_with(&scenario().expect("committed"), &file).expect("valid").config.web.address
+        };
+        assert!(address("[web]\nport = 8090\n").is_loopback());
+        assert!(address("[web]\naddress = \"0.0.0.0\"\n").is_unspecified());
+        std::fs::remove_file(&file).expect("it is there");
+    }
 }

@@ -228,6 +228,11 @@ fn check_names(config: &Config) -> Result<()> {
             .allowed("no such key on a stick")
             .remedy("leave it out: the appliance keeps what the PLC was told by itself"));
     }
+    if let Some(folder) = &config.archive.folder {
+        return Err(Error::configuration(format!("archive.folder = {}", folder.display()))
+            .allowed("no such key on a stick")
+            .remedy("leave it out: the appliance has a folder of its own for the archive"));
+    }
     Ok(())
 }
 

@@ -48,6 +48,7 @@ pub fn run(options: &Options<'_>) -> Result<()> {
     check_interface(site.config.camera.interface)?;
     if options.config.is_none() {
         site.config.plc.state_file.get_or_insert_with(|| store.plc_state());
+        site.config.archive.folder.get_or_insert_with(|| store.archive());
     }
     let can = CanSetUp { settings: site.config.can.clone(), done: None, complaint: None };
     let camera = site.config.camera.clone();

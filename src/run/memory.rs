@@ -4,6 +4,7 @@ use crate::config::Site;
 use crate::error::Result;
 use crate::pipeline::Pipeline;
 use crate::plan::{Block, Plan};
+use crate::run::desk::shots::{self, Shot};
 use crate::source::Recorder;
 
 /// Every buffer of the capture and vision path, as `beltgauge check` prints it.
@@ -16,16 +17,36 @@ pub fn plan(site: &Site) -> Plan {
         "limits.frames_queued_max raw frames between capture and vision",
     );
     Pipeline::plan(site, &mut plan);
+    shots::plan(site, &mut plan);
     plan
 }
 
-/// Map, carve and seal the memory: the frames and the pipeline.
-pub fn build(site: Site) -> Result<(Vec<Block<u8>>, Pipeline)> {
+/// What the memory is carved into.
+pub struct Carved {
+    /// Raw frames.
+    pub buffers: Vec<Block<u8>>,
+    /// The pipeline.
+    pub pipeline: Pipeline,
+    /// Pictures for people.
+    pub shots: Vec<Shot>,
+}
+
+/// Map, carve and seal the memory of the whole appliance.
+pub fn carve(site: Site) -> Result<Carved> {
     let mut memory = plan(&site).reserve(site.config.limits.memory_mib_max)?;
-    let frames = memory.take_parts("capture.frames", site.config.limits.frames_queued_max, 0)?;
+    let buffers = memory.take_parts("capture.frames", site.config.limits.frames_queued_max, 0)?;
     let pipeline = Pipeline::new(site, &mut memory)?;
+    let shots = shots::shots(pipeline.site(), &mut memory)?;
     memory.seal()?;
-    Ok((frames, pipeline))
+    Ok(Carved { buffers, pipeline, shots })
+}
+
+/// The same for a pipeline that nobody looks at: without pictures for people.
+pub fn build(mut site: Site) -> Result<(Vec<Block<u8>>, Pipeline)> {
+    site.config.web.enabled = false;
+    site.config.archive.folder = None;
+    let Carved { buffers, pipeline, .. } = carve(site)?;
+    Ok((buffers, pipeline))
 }
 
 /// What a recorder beside all of it may take, MiB. The sum of both is refused as one plan.

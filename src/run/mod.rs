@@ -3,12 +3,14 @@
 
 mod annotate;
 mod appliance;
+pub mod archive;
 pub mod board;
 pub mod budget;
 pub mod calibrate;
 pub mod demo;
 mod demo_kit;
 mod demo_results;
+mod desk;
 mod explain;
 pub mod import;
 pub mod live;

@@ -3,7 +3,8 @@
 use crate::config::Realtime;
 use crate::error::{Error, Result};
 use rustix::mm::{MlockAllFlags, mlockall};
-use rustix::thread::{CpuSet, sched_setaffinity};
+use rustix::process::setpriority_process;
+use rustix::thread::{CpuSet, gettid, sched_setaffinity};
 use thread_priority::{
     RealtimeThreadSchedulePolicy, ThreadPriority, ThreadSchedulePolicy,
     set_thread_priority_and_policy, thread_native_id,
@@ -18,6 +19,15 @@ pub fn lock_memory(settings: &Realtime) -> Result<()> {
         not_permitted("realtime.lock_memory = true", e)
             .remedy("give the process CAP_IPC_LOCK or raise its memlock limit, or set it to false")
     })
+}
+
+/// The niceness of threads that nobody waits for.
+const NICE: i32 = 10;
+
+/// The calling thread leaves the processor to those that measure.
+pub fn stand_back() {
+    // Where it may not, the threads share as equals.
+    let _ = setpriority_process(Some(gettid()), NICE);
 }
 
 /// Priority and processor of the calling thread, the `worker`th of the vision threads.

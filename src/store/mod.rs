@@ -129,6 +129,11 @@ impl Store {
         self.root.join("plc.state")
     }
 
+    /// Where the archive is, whatever the configuration.
+    pub fn archive(&self) -> PathBuf {
+        self.root.join("archive")
+    }
+
     /// What is known of the last import that ended; nothing is, when it cannot be read.
     pub fn last_import(&self) -> ImportRecord {
         self.imports().last

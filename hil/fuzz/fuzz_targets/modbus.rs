@@ -3,6 +3,7 @@
 #![no_main]
 
 use beltgauge::config::{Modbus, Plc, WordOrder};
+use beltgauge::plc::clients::ClientList;
 use beltgauge::plc::journal::Journal;
 use beltgauge::plc::link::Link;
 use beltgauge::plc::modbus;
@@ -25,13 +26,19 @@ static SERVER: LazyLock<SocketAddr> = LazyLock::new(|| {
         let plc = Plc { queue: true, ..Plc::default() };
         let now = Instant::now();
         let link = Link::new(plc, WordOrder::HighFirst, false, Journal::default(), now);
-        let served = modbus::serve(listener, &settings, link, |link| {
-            let (vision, can) = (VisionStatus::default(), CanStatus::default());
-            link.update(&vision, &can, None, Instant::now());
-            while link.next_request().is_some() {}
-            while link.next_count().is_some() {}
-            true
-        });
+        let served = modbus::serve(
+            listener,
+            &settings,
+            ClientList::new(settings.connections_max),
+            link,
+            |link| {
+                let (vision, can) = (VisionStatus::default(), CanStatus::default());
+                link.update(&vision, &can, None, Instant::now());
+                while link.next_request().is_some() {}
+                while link.next_count().is_some() {}
+                true
+            },
+        );
         served.expect("serves for ever");
     });
     address

@@ -1,6 +1,6 @@
 //! What a PLC writes: the command block's registers, acknowledgments, commands.
 
-use super::{Decided, Link, REQUESTS_MAX};
+use super::{Commanded, Decided, Link, REQUESTS_MAX};
 use crate::plc::command::{Outcome, Request, Sender};
 use crate::plc::journal::{Override, is_after};
 use crate::plc::registers::{COMMAND, COMMAND_COUNT, COMMAND_FIELDS, CommandBlock};
@@ -78,6 +78,7 @@ impl Link {
             self.count(block.encoder_count, now);
         }
         self.block = block;
+        self.written = Some((sender, now));
         if written(4) {
             noted =
                 noted.max(self.command(block.ticket, block.command, block.argument, sender).noted);
@@ -131,6 +132,7 @@ impl Link {
             if ticket == 0 { (Outcome::None, None) } else { self.decide(command, argument) };
         if ticket != 0 {
             tracing::info!(%sender, ticket, command, argument, ?outcome, "command");
+            self.commanded = Some(Commanded { sender, ticket, command, argument });
         }
         let noted = self.journal.change(|state| {
             (state.ticket, state.outcome) = (ticket, outcome as u16);

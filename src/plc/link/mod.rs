@@ -10,7 +10,7 @@ pub use commands::{Answer, Refusal};
 
 use crate::config::{Plc as Settings, WordOrder};
 use crate::event::ParcelRecord;
-use crate::plc::command::{Outcome, Request};
+use crate::plc::command::{Outcome, Request, Sender};
 use crate::plc::journal::{Journal, Keeping, Override, State, is_after};
 use crate::plc::present::presented;
 use crate::plc::registers::{
@@ -54,6 +54,11 @@ pub struct Link {
     to_send: Deque<ParcelRecord, QUEUE_PARCELS>,
     /// Parcels that found `to_send` full.
     unsent: u64,
+    /// Published, and not yet told to those who watch.
+    published: Deque<ParcelRecord, QUEUE_PARCELS>,
+    /// Who wrote registers last, and when.
+    written: Option<(Sender, Instant)>,
+    commanded: Option<Commanded>,
     /// Parcels that found `waiting` full.
     unpublished: u64,
     counts: Deque<(u32, Instant), COUNTS_MAX>,
@@ -65,6 +70,19 @@ pub struct Link {
     plc_alive: Instant,
     encoder_alive: Option<Instant>,
     beats: Beats,
+}
+
+/// The last command, as it was given.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct Commanded {
+    /// By whom.
+    pub sender: Sender,
+    /// Its ticket.
+    pub ticket: u16,
+    /// Its code.
+    pub command: u16,
+    /// Its argument.
+    pub argument: u32,
 }
 
 /// A command that was decided on, and is carried out and told when the disk has it.
@@ -117,6 +135,9 @@ impl Link {
             sends,
             to_send: Deque::new(),
             unsent: 0,
+            published: Deque::new(),
+            written: None,
+            commanded: None,
             unpublished: 0,
             counts: Deque::new(),
             requests: Deque::new(),
@@ -343,6 +364,11 @@ impl Link {
     fn show_parcel(&mut self, record: ParcelRecord) {
         self.status.sequence = record.seq;
         self.image.publish(&record);
+        if self.published.is_full() {
+            // Nobody watches.
+            self.published.pop_front();
+        }
+        let _ = self.published.push_back(record); // invariant: there is room
         if self.settings.queue {
             if self.queue.is_full() {
                 self.queue.pop_front();
@@ -389,6 +415,21 @@ impl Link {
         let record = self.to_send.pop_front()?;
         self.journal.sent(record.seq);
         Some(record)
+    }
+
+    /// The next parcel that was published since this was last asked; the last ones, when it was long ago.
+    pub fn next_published(&mut self) -> Option<ParcelRecord> {
+        self.published.pop_front()
+    }
+
+    /// The last command of this run.
+    pub fn commanded(&self) -> Option<Commanded> {
+        self.commanded
+    }
+
+    /// Who wrote registers last, and when.
+    pub fn written(&self) -> Option<(Sender, Instant)> {
+        self.written
     }
 
     /// The next count of the encoder, and when it came.

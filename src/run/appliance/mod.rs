@@ -2,15 +2,19 @@
 //!
 //! ```text
 //! source -> [ready ring] -> pipeline -> [records] -> link: Modbus, CAN
-//!    ^------ [free ring] <-----'  ^        '-------> observer (console, pictures)
-//!                                 '--- [counts, requests] --- link
+//!    ^------ [free ring] <-----'  ^  |     '-------> observer (console)
+//!                                 |  '-- [shots] --> desk: page, archive
+//!                                 '--- [counts, requests] --- link -- [published] --> desk
 //! ```
 //! A frame buffer is always in exactly one place. When no buffer is free the frame is dropped
 //! and counted; when a record ring is full the record is counted; vision never waits.
 
 mod capture;
+mod plc;
 mod vision;
 
+use super::desk::{self, Desk, Insight, Rings};
+use super::memory::Carved;
 use super::realtime;
 use super::watchdog::{Beats, Watchdog};
 use crate::belt::Encoder;
@@ -18,16 +22,16 @@ use crate::config::Site;
 use crate::error::{Error, Result};
 use crate::event::ParcelRecord;
 use crate::plan::Block;
-use crate::plc::can::CanLink;
+use crate::plc::clients::ClientList;
 use crate::plc::command::Request;
 use crate::plc::journal::Journal;
-use crate::plc::link::Link;
 use crate::plc::modbus;
 use crate::plc::registers::{ImportStatus, VisionStatus};
 use crate::source::{Feed, FeedStatus, Taken};
+use crate::web::{self, Board};
 use capture::Capture;
 use heapless::spsc::Queue;
-use socketcan::CanFdSocket;
+use plc::PlcThread;
 use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
 use std::sync::{Arc, Mutex, OnceLock};
 use std::time::{Duration, Instant};
@@ -37,6 +41,8 @@ use vision::Vision;
 const FRAME_RING: usize = 16;
 /// Records that wait for the PLC thread; at 2 ms a visit it is nearly always empty.
 const RECORD_RING: usize = 64;
+/// Stack of the threads for page and archive: locked memory counts all of it.
+const SERVICE_STACK_BYTES: usize = 512 * 1024;
 /// Encoder counts on their way to vision, and one: two frames at 1000 counts a second.
 const COUNT_RING: usize = 128;
 /// Requests on their way to vision, and one.
@@ -75,6 +81,7 @@ pub struct Appliance {
     journal: Journal,
     imports: ImportBoard,
     watchdog: Watchdog,
+    page: Option<web::Listening>,
 }
 
 /// What the threads share.
@@ -83,6 +90,10 @@ struct Shared {
     stop: AtomicBool,
     source_ended: AtomicBool,
     vision_ended: AtomicBool,
+    /// Vision and PLC have ended: nothing more comes to the desk.
+    over: AtomicBool,
+    /// The thread that makes pictures, once it runs.
+    desk: OnceLock<std::thread::Thread>,
     /// The thread that takes the frames, once it runs.
     vision: OnceLock<std::thread::Thread>,
     /// Of the threads, for the watchdog.
@@ -105,6 +116,17 @@ impl Shared {
         if let Some(vision) = self.vision.get() {
             vision.unpark();
         }
+    }
+
+    fn wake_desk(&self) {
+        if let Some(desk) = self.desk.get() {
+            desk.unpark();
+        }
+    }
+
+    fn end_all(&self) {
+        self.stop.store(true, Ordering::Relaxed);
+        self.over.store(true, Ordering::Release);
     }
 
     fn stopped(&self) -> bool {
@@ -131,7 +153,14 @@ impl Appliance {
         let journal = site.config.plc.state_file.as_deref().map(Journal::open).transpose()?;
         let journal = journal.unwrap_or_default();
         let (imports, watchdog) = (ImportBoard::default(), Watchdog::default());
-        Ok(Self { site, listener, journal, imports, watchdog })
+        // An address that is taken is no reason not to measure: it is told, and tried again.
+        let page = site.config.web.enabled.then(|| web::listen(&site.config.web));
+        Ok(Self { site, listener, journal, imports, watchdog, page })
+    }
+
+    /// Where the page is served, if it is.
+    pub fn page_address(&self) -> Option<std::net::SocketAddr> {
+        self.page.as_ref()?.as_ref().ok()?.local_addr().ok()
     }
 
     /// Watch the threads, and tell the PLC of imports, which the observer puts on this board.
@@ -152,11 +181,14 @@ impl Appliance {
         self.site.check_image_size(feed.size_px())?;
         let config = self.site.config.clone();
         let (listener, journal, mut watchdog) = (self.listener, self.journal, self.watchdog);
+        let clients = ClientList::new(config.modbus.connections_max);
+        let insight = Arc::new(Insight::new(config.clone(), feed.size_px(), clients.clone()));
+        let (page, board) = (self.page, desk::board());
         let encoder = config.encoder.mm_per_count.map(|mm| {
             let speed_max_mm_per_s = ENCODER_SPEED_MAX * config.belt.speed_mm_per_s;
             Encoder::new(mm, config.encoder.bits, config.encoder.timeout_s, speed_max_mm_per_s)
         });
-        let (buffers, pipeline) = super::memory::build(self.site)?;
+        let Carved { buffers, pipeline, shots } = super::memory::carve(self.site)?;
         realtime::lock_memory(&config.realtime)?;
         let shared = Shared { imports: self.imports, ..Shared::default() };
         let (mut free, mut ready) =
@@ -167,11 +199,15 @@ impl Appliance {
         );
         let (mut counts, mut requests) =
             (Queue::<(u32, Instant), COUNT_RING>::new(), Queue::<Request, REQUEST_RING>::new());
-        let ((mut count_in, count_out), (mut request_in, request_out)) =
-            (counts.split(), requests.split());
+        let ((count_in, count_out), (request_in, request_out)) = (counts.split(), requests.split());
         let ((mut free_in, free_out), (ready_in, ready_out)) = (free.split(), ready.split());
-        let ((plc_in, mut plc_out), (observer_in, mut observer_out)) =
+        let ((plc_in, plc_out), (observer_in, mut observer_out)) =
             (to_plc.split(), to_observer.split());
+        // Large: a shot holds all that is drawn into it.
+        let mut rings = Box::new(Rings::new());
+        let (photographer, album) = rings.split();
+        let mut to_desk = Queue::<ParcelRecord, RECORD_RING>::new();
+        let (published_in, published) = to_desk.split();
         for buffer in buffers {
             // limits.frames_queued_max is below FRAME_RING.
             let _ = free_in.enqueue(buffer);
@@ -179,8 +215,23 @@ impl Appliance {
         std::thread::scope(|scope| {
             let shared = &shared;
             // However this closure is left, the threads must end, or the scope waits for ever.
-            let _stop = StopOnDrop(shared);
+            let _stop = StopOnDrop { shared, board: &board };
             let config = &config;
+            if desk::shots::wanted(pipeline.site()) {
+                let (insight, board) = (Arc::clone(&insight), Arc::clone(&board));
+                let desk = Desk::new(pipeline.site(), shots, album, published, insight, board)?;
+                spawn_service(scope, "desk", move || {
+                    shared.desk.get_or_init(std::thread::current);
+                    desk.run(&|| shared.progress(), &|| shared.over.load(Ordering::Acquire))
+                })?;
+            }
+            if let Some(page) = page {
+                let (insight, board) = (Arc::clone(&insight), Arc::clone(&board));
+                spawn_service(scope, "web", move || {
+                    realtime::stand_back();
+                    web::serve(&config.web, page, &board, insight)
+                })?;
+            }
             let vision = Vision {
                 pipeline,
                 ready: ready_out,
@@ -189,48 +240,25 @@ impl Appliance {
                 encoder: encoder.map(|encoder| (encoder, Instant::now())),
                 counts: count_out,
                 requests: request_out,
+                photographer,
                 shared,
             };
             let vision = spawn(scope, "vision", move || vision.run_on(&config.realtime))?;
             let capture = Capture::new(feed, free_out, ready_in, shared);
             let capture = spawn(scope, "capture", move || capture.run())?;
-            let plc = spawn(scope, "plc", move || {
-                let now = Instant::now();
-                let encoder_timeout = config.encoder.mm_per_count.map(|_| config.encoder.timeout_s);
-                let encoder_timeout = encoder_timeout.map(Duration::from_secs_f64);
-                let mut can = CanLink::<CanFdSocket>::new(config.can.clone(), now);
-                let sends = config.can.interface.is_some();
-                let order = config.modbus.word_order;
-                let link = Link::new(config.plc.clone(), order, sends, journal, now)
-                    .with_encoder(config.encoder.mm_per_count);
-                let mut ended_at = None;
-                modbus::serve(listener, &config.modbus, link, |link| {
-                    shared.beats.plc.beat();
-                    // Asked before the ring is emptied: what came before the end is published.
-                    let ended = shared.vision_ended.load(Ordering::Acquire);
-                    while let Some((record, travel_mm)) = plc_out.dequeue() {
-                        link.record(record, travel_mm);
-                    }
-                    let now = Instant::now();
-                    if ended {
-                        link.flush();
-                        ended_at.get_or_insert(now);
-                    }
-                    link.update(&shared.progress().status, &can.status(), encoder_timeout, now);
-                    can.step(link, now);
-                    // A ring that is full has enough of them: vision has not looked for long.
-                    while let Some(count) = link.next_count() {
-                        let _ = count_in.enqueue(count);
-                    }
-                    while request_in.ready()
-                        && let Some(request) = link.next_request()
-                    {
-                        let _ = request_in.enqueue(request);
-                    }
-                    let all_told = link.is_idle() && can.is_idle();
-                    ended_at.is_none_or(|at| !all_told && now - at < FAREWELL)
-                })
-            })?;
+            let plc = PlcThread {
+                config,
+                listener,
+                clients,
+                journal,
+                records: plc_out,
+                counts: count_in,
+                requests: request_in,
+                published: published_in,
+                insight: Arc::clone(&insight),
+                shared,
+            };
+            let plc = spawn(scope, "plc", move || plc.run())?;
             while !(capture.is_finished() || vision.is_finished() || plc.is_finished()) {
                 std::thread::park_timeout(PARK);
                 watchdog.look(&shared.beats, [true; 3]);
@@ -253,13 +281,19 @@ impl Appliance {
 }
 
 /// Lets every thread end.
-struct StopOnDrop<'a>(&'a Shared);
+struct StopOnDrop<'a> {
+    shared: &'a Shared,
+    board: &'a Board,
+}
 
 impl Drop for StopOnDrop<'_> {
     fn drop(&mut self) {
-        self.0.stop.store(true, Ordering::Relaxed);
-        self.0.source_ended.store(true, Ordering::Release);
-        self.0.vision_ended.store(true, Ordering::Release);
+        self.shared.end_all();
+        self.shared.wake_desk();
+        // However the desk has ended.
+        self.board.close();
+        self.shared.source_ended.store(true, Ordering::Release);
+        self.shared.vision_ended.store(true, Ordering::Release);
     }
 }
 
@@ -273,6 +307,25 @@ fn spawn<'scope, 'env>(
     std::thread::Builder::new()
         .name(name.to_owned())
         .spawn_scoped(scope, body)
+        .map_err(|e| Error::failure(format!("cannot start the {name} thread: {e}")))
+}
+
+/// Start a thread that nobody waits for and whose failure is told, and is no reason to stop measuring.
+fn spawn_service<'scope>(
+    scope: &'scope std::thread::Scope<'scope, '_>,
+    name: &'static str,
+    body: impl FnOnce() -> Result<()> + Send + 'scope,
+) -> Result<()> {
+    let told = move || {
+        if let Err(e) = body() {
+            tracing::error!("the {name} thread has ended: {e}");
+        }
+    };
+    std::thread::Builder::new()
+        .name(name.to_owned())
+        .stack_size(SERVICE_STACK_BYTES)
+        .spawn_scoped(scope, told)
+        .map(drop)
         .map_err(|e| Error::failure(format!("cannot start the {name} thread: {e}")))
 }
 

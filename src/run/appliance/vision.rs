@@ -10,6 +10,7 @@ use crate::pipeline::{Health, Pipeline};
 use crate::plan::Block;
 use crate::plc::command::Request;
 use crate::plc::registers::BeltStatus;
+use crate::run::desk::Photographer;
 use crate::run::realtime;
 use crate::source::Taken;
 use crate::stage::odometry::Knowledge;
@@ -28,6 +29,7 @@ pub(super) struct Vision<'a> {
     pub(super) encoder: Option<(Encoder, Instant)>,
     pub(super) counts: Consumer<'a, (u32, Instant)>,
     pub(super) requests: Consumer<'a, Request>,
+    pub(super) photographer: Photographer<'a>,
     pub(super) shared: &'a Shared,
 }
 
@@ -84,6 +86,9 @@ impl Vision<'_> {
                 overflows += u64::from(plc.enqueue((record, travel_mm)).is_err());
                 // An observer that does not look misses records; the PLC never does.
                 let _ = observer.enqueue(record);
+            }
+            if self.photographer.look(&self.pipeline, raw, time) {
+                self.shared.wake_desk();
             }
             self.publish(time.t_s, began.elapsed(), overflows);
             let _ = self.free.enqueue(frame.pixels);

@@ -1,0 +1,188 @@
+//! Reads an archive, also one that is being written.
+
+use super::segment::{self, EntryHead, Segment, Sum};
+use super::{Entry, Kind};
+use crate::error::{Error, Result};
+use std::path::{Path, PathBuf};
+
+/// An entry as it was found.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct Stored {
+    /// Its number, from 1; numbers never skip.
+    pub number: u64,
+    /// What was kept; the picture may be left out.
+    pub entry: Entry,
+}
+
+/// What [`Reader::verify`] found.
+#[derive(Clone, Debug, Default, PartialEq, Eq)]
+pub struct Verdict {
+    /// Whole entries.
+    pub entries: u64,
+    /// Number of the first one.
+    pub first: Option<u64>,
+    /// Number of the last one.
+    pub last: Option<u64>,
+    /// The sum of the chain up to there.
+    pub sum: Sum,
+    /// Entries that the disk did not take, as the chain tells.
+    pub told_lost: u64,
+    /// Bytes that power cuts left half-written.
+    pub torn_bytes: u64,
+    /// Where the chain is broken: something was changed, taken out, or damaged.
+    pub broken: Vec<String>,
+}
+
+/// An archive to read.
+#[derive(Clone, Debug)]
+pub struct Reader {
+    folder: PathBuf,
+}
+
+impl Reader {
+    /// Of the archive in a folder, which must be there.
+    pub fn open(folder: &Path) -> Result<Self> {
+        if folder.is_dir() {
+            return Ok(Self { folder: folder.to_owned() });
+        }
+        Err(Error::configuration("there is no archive")
+            .in_file(folder)
+            .allowed("the folder of archive.folder, or STORE/archive of an appliance")
+            .remedy("give the archive's folder"))
+    }
+
+    fn failed(&self, e: &std::io::Error) -> Error {
+        Error::failure(format!("cannot read the archive: {e}")).in_file(&self.folder)
+    }
+
+    fn segments(&self) -> Result<Vec<(u64, PathBuf)>> {
+        segment::list(&self.folder).map_err(|e| self.failed(&e))
+    }
+
+    /// At most `limit` entries before number `before` (none: from the newest on), newest first, without
+    /// their pictures. A page takes as long as one segment, however large the archive is.
+    pub fn before(&self, before: Option<u64>, limit: usize) -> Result<Vec<Stored>> {
+        let before = before.unwrap_or(u64::MAX);
+        let mut found = Vec::new();
+        for (first, path) in self.segments()?.into_iter().rev() {
+            if first >= before || found.len() == limit {
+                continue;
+            }
+            let read = Self::last_of(&path, before, limit - found.len(), &mut found);
+            // The writer may have taken it away.
+            match read {
+                Err(e) if e.kind() != std::io::ErrorKind::NotFound => return Err(self.failed(&e)),
+                _ => {}
+            }
+        }
+        Ok(found)
+    }
+
+    fn last_of(
+        path: &Path,
+        before: u64,
+        limit: usize,
+        found: &mut Vec<Stored>,
+    ) -> std::io::Result<()> {
+        let Some(mut segment) = Segment::open(path)? else { return Ok(()) };
+        let length = std::fs::metadata(path)?.len();
+        let mut heads: Vec<(EntryHead, u64)> = Vec::new();
+        while let Some((head, at)) = segment.pass(length)? {
+            if head.number >= before {
+                break;
+            }
+            heads.push((head, at));
+        }
+        for (head, at) in heads.into_iter().rev().take(limit) {
+            segment.seek(at)?;
+            // Its sum is not asked for: that takes the ones before.
+            if let Some((_, mut entry, _)) = segment.next(&Sum::default())? {
+                entry.picture = Vec::new();
+                found.push(Stored { number: head.number, entry });
+            }
+        }
+        Ok(())
+    }
+
+    /// One entry with its picture.
+    pub fn entry(&self, number: u64) -> Result<Option<Stored>> {
+        let holds = |(first, _): &&(u64, PathBuf)| *first <= number;
+        let segments = self.segments()?;
+        let Some((_, path)) = segments.iter().rev().find(holds) else { return Ok(None) };
+        let read = || -> std::io::Result<Option<Stored>> {
+            let Some(mut segment) = Segment::open(path)? else { return Ok(None) };
+            let length = std::fs::metadata(path)?.len();
+            while let Some((head, at)) = segment.pass(length)? {
+                if head.number == number {
+                    segment.seek(at)?;
+                    let next = segment.next(&Sum::default())?;
+                    return Ok(next.map(|(head, entry, _)| Stored { number: head.number, entry }));
+                }
+            }
+            Ok(None)
+        };
+        read().map_err(|e| self.failed(&e))
+    }
+
+    /// Every whole entry, oldest first.
+    ///
+    /// # Errors
+    /// What the disk or `each` says.
+    pub fn each(&self, mut each: impl FnMut(Stored) -> Result<()>) -> Result<Verdict> {
+        let mut verdict = Verdict::default();
+        for (first, path) in self.segments()? {
+            self.walk(first, &path, &mut verdict, &mut each)?;
+        }
+        Ok(verdict)
+    }
+
+    /// Whether the chain is whole.
+    pub fn verify(&self) -> Result<Verdict> {
+        self.each(|_| Ok(()))
+    }
+
+    fn walk(
+        &self,
+        first: u64,
+        path: &Path,
+        verdict: &mut Verdict,
+        each: &mut impl FnMut(Stored) -> Result<()>,
+    ) -> Result<()> {
+        let failed = |e: std::io::Error| self.failed(&e);
+        let name = path.display();
+        let Some(mut segment) = Segment::open(path).map_err(failed)? else {
+            verdict.broken.push(format!("{name}: its head is damaged"));
+            return Ok(());
+        };
+        let (mut sum, mut next) = (segment.head.before, segment.head.first);
+        if next != first {
+            verdict.broken.push(format!("{name}: begins with entry {next}, not as it is called"));
+        }
+        if let Some(last) = verdict.last
+            && (last + 1 != next || verdict.sum != sum)
+        {
+            verdict.broken.push(format!("{name}: does not go on from entry {last}"));
+        }
+        while let Some((head, entry, [written, comes_out])) = segment.next(&sum).map_err(failed)? {
+            if head.number != next {
+                let found = head.number;
+                verdict.broken.push(format!("{name}: entry {found} where {next} should be"));
+            }
+            if written != comes_out {
+                verdict.broken.push(format!("{name}: entry {} was changed", head.number));
+            }
+            (sum, next) = (written, head.number + 1);
+            verdict.first.get_or_insert(head.number);
+            (verdict.last, verdict.sum) = (Some(head.number), sum);
+            verdict.entries += 1;
+            if entry.kind == Kind::Gap {
+                let gap: serde_json::Value = serde_json::from_str(&entry.text).unwrap_or_default();
+                verdict.told_lost += gap["lost"].as_u64().unwrap_or(0);
+            }
+            each(Stored { number: head.number, entry })?;
+        }
+        let length = std::fs::metadata(path).map_err(failed)?.len();
+        verdict.torn_bytes += length.saturating_sub(segment.offset);
+        Ok(())
+    }
+}

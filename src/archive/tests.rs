@@ -1,0 +1,221 @@
+//! Disks that fill up, break and lose power.
+
+use super::segment::{HEAD_BYTES, list};
+use super::writer::Space;
+use super::*;
+use std::fs;
+use std::path::{Path, PathBuf};
+use std::time::{Duration, Instant};
+
+const PATIENCE: Duration = Duration::from_secs(10);
+const MIB: u64 = 1 << 20;
+
+fn folder(name: &str) -> PathBuf {
+    let folder =
+        std::env::temp_dir().join(format!("beltgauge-archive-{name}-{}", std::process::id()));
+    let _ = fs::remove_dir_all(&folder);
+    fs::create_dir_all(&folder).expect("room");
+    folder
+}
+
+fn entry(i: u64, bytes: usize) -> Entry {
+    Entry {
+        kind: Kind::Parcel,
+        utc_ms: 1_795_000_000_000 + i,
+        text: format!("{{\"seq\":{i}}}"),
+        picture: vec![i as u8; bytes],
+    }
+}
+
+/// Write entries one at a time, so that the ring never fills.
+fn write(archive: &Archive, entries: impl Iterator<Item = Entry>) {
+    for entry in entries {
+        let before = archive.condition();
+        archive.put(entry);
+        let start = Instant::now();
+        while archive.condition().written + archive.condition().lost == before.written + before.lost
+        {
+            assert!(start.elapsed() < PATIENCE, "the writer does nothing");
+            std::thread::yield_now();
+        }
+    }
+}
+
+fn newest(folder: &Path) -> PathBuf {
+    list(folder).expect("readable").pop().expect("a segment").1
+}
+
+#[test]
+fn what_was_written_is_read_again_newest_first_and_the_chain_holds() {
+    let folder = folder("whole");
+    let archive = Archive::start(&folder, 64 * MIB).expect("starts");
+    write(&archive, (1..=120).map(|i| entry(i, 100_000)));
+    archive.finish(PATIENCE);
+    assert!(list(&folder).expect("readable").len() > 1, "several segments");
+    let reader = Reader::open(&folder).expect("there");
+    let verdict = reader.verify().expect("readable");
+    assert_eq!((verdict.entries, verdict.first, verdict.last), (120, Some(1), Some(120)));
+    assert!(verdict.broken.is_empty() && verdict.torn_bytes == 0, "{:?}", verdict.broken);
+    let numbers = |before, limit| {
+        let found = reader.before(before, limit).expect("readable");
+        found.iter().map(|stored| stored.number).collect::<Vec<_>>()
+    };
+    assert_eq!(numbers(None, 3), [120, 119, 118]);
+    assert_eq!(numbers(Some(85), 100), (1..85).rev().collect::<Vec<_>>(), "over segments");
+    assert!(numbers(Some(1), 10).is_empty());
+    assert_eq!(reader.entry(77).expect("readable").expect("there").entry, entry(77, 100_000));
+    assert_eq!(reader.entry(121).expect("readable"), None);
+}
+
+#[test]
+fn it_goes_on_where_it_ended_and_the_oldest_go_first() {
+    let folder = folder("goes-on");
+    for run in 0..3 {
+        let archive = Archive::start(&folder, 16 * MIB).expect("starts");
+        write(&archive, (1..=100).map(|i| entry(100 * run + i, 100_000)));
+        let condition = archive.condition();
+        assert!(condition.bytes <= 16 * MIB && condition.lost == 0, "{condition:?}");
+        archive.finish(PATIENCE);
+    }
+    let on_disk: u64 = list(&folder)
+        .expect("readable")
+        .iter()
+        .map(|(_, path)| fs::metadata(path).expect("there").len())
+        .sum();
+    assert!(on_disk <= 16 * MIB && on_disk > 12 * MIB, "{on_disk}");
+    let verdict = Reader::open(&folder).expect("there").verify().expect("readable");
+    assert_eq!(verdict.last, Some(300));
+    assert!(verdict.first > Some(100) && verdict.broken.is_empty(), "{verdict:?}");
+}
+
+#[test]
+fn a_power_cut_at_any_byte_costs_the_entry_that_was_being_written_and_nothing_else() {
+    let folder = folder("power");
+    let archive = Archive::start(&folder, 64 * MIB).expect("starts");
+    write(&archive, (1..=5).map(|i| entry(i, 40)));
+    archive.finish(PATIENCE);
+    let path = newest(&folder);
+    let whole = fs::read(&path).expect("there");
+    let entry_bytes = (whole.len() - HEAD_BYTES) / 5;
+    for length in 0..=whole.len() {
+        let _ = fs::remove_dir_all(&folder);
+        fs::create_dir_all(&folder).expect("room");
+        fs::write(&path, &whole[..length]).expect("room");
+        let left = length.saturating_sub(HEAD_BYTES) / entry_bytes;
+        let archive = Archive::start(&folder, 64 * MIB).expect("starts");
+        write(&archive, (101..=102).map(|i| entry(i, 40)));
+        archive.finish(PATIENCE);
+        let reader = Reader::open(&folder).expect("there");
+        let verdict = reader.verify().expect("readable");
+        assert_eq!(verdict.entries, left as u64 + 2, "cut at {length}");
+        assert_eq!(verdict.last, Some(left as u64 + 2), "cut at {length}");
+        assert!(verdict.broken.is_empty(), "cut at {length}: {:?}", verdict.broken);
+    }
+}
+
+#[test]
+fn a_changed_a_missing_and_a_swapped_entry_show() {
+    let folder = folder("changed");
+    let archive = Archive::start(&folder, 64 * MIB).expect("starts");
+    write(&archive, (1..=250).map(|i| entry(i, 100_000)));
+    archive.finish(PATIENCE);
+    let reader = Reader::open(&folder).expect("there");
+    let broken = || reader.verify().expect("readable").broken;
+    assert!(broken().is_empty());
+    let segments = list(&folder).expect("readable");
+    assert!(segments.len() >= 3, "{}", segments.len());
+    let middle = &segments[1].1;
+    let bytes = fs::read(middle).expect("there");
+    for at in [20, HEAD_BYTES + 9, HEAD_BYTES + 40, bytes.len() - 1] {
+        let mut changed = bytes.clone();
+        changed[at] ^= 1;
+        fs::write(middle, &changed).expect("room");
+        assert!(!broken().is_empty(), "byte {at}");
+    }
+    fs::remove_file(middle).expect("there");
+    assert!(!broken().is_empty(), "a segment is missing");
+    fs::write(middle, &bytes).expect("room");
+    assert!(broken().is_empty(), "as it was");
+}
+
+#[test]
+fn a_disk_that_does_not_obey_costs_entries_that_are_counted_and_told() {
+    let folder = folder("fails");
+    // A file where the folder should be: nothing can be written there.
+    let inside = folder.join("archive");
+    fs::write(&inside, "in the way").expect("room");
+    let archive = Archive::start(&inside, 64 * MIB).expect("starts all the same");
+    write(&archive, (1..=3).map(|i| entry(i, 10)));
+    let condition = archive.condition();
+    assert_eq!((condition.written, condition.lost), (0, 3));
+    assert!(condition.fault.is_some());
+    fs::remove_file(&inside).expect("there");
+    let start = Instant::now();
+    while archive.condition().fault.is_some() {
+        assert!(start.elapsed() < PATIENCE, "it is not tried again");
+        std::thread::sleep(Duration::from_millis(20));
+    }
+    write(&archive, std::iter::once(entry(4, 10)));
+    archive.finish(PATIENCE);
+    let verdict = Reader::open(&inside).expect("there").verify().expect("readable");
+    assert_eq!((verdict.entries, verdict.told_lost), (2, 3), "the gap and the parcel");
+}
+
+#[test]
+fn more_entries_than_the_ring_holds_are_counted_and_nobody_waits() {
+    let folder = folder("ring");
+    let inside = folder.join("pipe");
+    fs::create_dir(&inside).expect("room");
+    // Opening a pipe waits for ever: the slowest disk there is.
+    let pipe = std::process::Command::new("mkfifo").arg(inside.join("lock")).status();
+    assert!(pipe.is_ok_and(|status| status.success()));
+    let archive = Archive::start(&inside, 64 * MIB).expect("starts");
+    (1..=1000).for_each(|i| archive.put(entry(i, 10)));
+    let condition = archive.condition();
+    // One may be in the writer's hands.
+    assert!(condition.written == 0 && (935..=936).contains(&condition.lost), "{condition:?}");
+    archive.finish(Duration::from_millis(1));
+}
+
+#[test]
+fn two_processes_do_not_write_one_archive() {
+    let folder = folder("two");
+    let first = Archive::start(&folder, 64 * MIB).expect("starts");
+    write(&first, std::iter::once(entry(1, 10)));
+    let second = Archive::start(&folder, 64 * MIB).expect("starts");
+    write(&second, std::iter::once(entry(2, 10)));
+    assert!(second.condition().fault.is_some_and(|fault| fault.contains("another process")));
+    first.finish(PATIENCE);
+    second.finish(PATIENCE);
+}
+
+/// A disk of 64 MiB, as the flashed image's, on which everything else takes 10 MiB.
+fn small_disk(folder: &Path) -> std::io::Result<Space> {
+    let mut used = 10 * MIB;
+    for (_, path) in list(folder)? {
+        used += fs::metadata(path)?.len();
+    }
+    Ok(Space { all: 64 * MIB, free: (64 * MIB).saturating_sub(used) })
+}
+
+fn full_disk(folder: &Path) -> std::io::Result<Space> {
+    small_disk(folder).map(|disk| Space { free: 20 * MIB, ..disk })
+}
+
+#[test]
+fn it_leaves_room_on_a_disk_that_is_smaller_than_it_may_be() {
+    let folder = folder("small");
+    let archive = Archive::start_on(&folder, 2048 * MIB, small_disk).expect("starts");
+    write(&archive, (1..=600).map(|i| entry(i, 100_000)));
+    assert_eq!(archive.condition().lost, 0, "the oldest went instead");
+    archive.finish(PATIENCE);
+    let left = small_disk(&folder).expect("readable").free;
+    assert!((24 * MIB..34 * MIB).contains(&left), "{left}");
+    let verdict = Reader::open(&folder).expect("there").verify().expect("readable");
+    assert!(verdict.last == Some(600) && verdict.broken.is_empty(), "{verdict:?}");
+    let archive = Archive::start_on(&folder, 2048 * MIB, full_disk).expect("starts");
+    write(&archive, std::iter::once(entry(601, 10)));
+    let condition = archive.condition();
+    assert!(condition.lost == 1 && condition.fault.is_some(), "{condition:?}");
+    archive.finish(PATIENCE);
+}

@@ -1,0 +1,72 @@
+//! The tables of what people see: the web page, and the archive behind it.
+
+use crate::error::{Error, Result};
+use schemars::JsonSchema;
+use serde::{Deserialize, Serialize};
+use std::net::{IpAddr, Ipv4Addr};
+use std::path::PathBuf;
+
+/// `[web]`: the page for people, and figures for machines.
+#[derive(Clone, Debug, PartialEq, Eq, Deserialize, Serialize, JsonSchema)]
+#[serde(deny_unknown_fields, default)]
+pub struct Web {
+    /// Serve it.
+    pub enabled: bool,
+    /// Address of this machine that it is served at; 0.0.0.0: all of them.
+    pub address: IpAddr,
+    /// Its port.
+    pub port: u16,
+    /// Names that browsers may call this machine by, besides its own, `localhost` and any address.
+    pub hosts: Vec<String>,
+    /// Connections at once; a browser opens up to six.
+    pub connections_max: usize,
+    /// Live pictures a second, whoever and how many look.
+    pub pictures_per_s_max: u32,
+}
+
+impl Default for Web {
+    fn default() -> Self {
+        Self {
+            enabled: true,
+            address: IpAddr::V4(Ipv4Addr::UNSPECIFIED),
+            port: 8080,
+            hosts: Vec::new(),
+            connections_max: 64,
+            pictures_per_s_max: 10,
+        }
+    }
+}
+
+/// `[archive]`: parcels with their pictures, and events, on the disk.
+#[derive(Clone, Debug, PartialEq, Eq, Deserialize, Serialize, JsonSchema)]
+#[serde(deny_unknown_fields, default)]
+pub struct Archive {
+    /// Its folder, relative to the configuration file; none given: the store's, or none.
+    pub folder: Option<PathBuf>,
+    /// It takes no more of the disk; the oldest goes first.
+    pub mib_max: usize,
+}
+
+impl Default for Archive {
+    fn default() -> Self {
+        Self { folder: None, mib_max: 2048 }
+    }
+}
+
+/// The longest name that the domain name system has.
+const HOST_CHARACTERS_MAX: usize = 253;
+
+impl Web {
+    pub(super) fn check(&self) -> Result<()> {
+        let is_name = |host: &&String| {
+            (1..=HOST_CHARACTERS_MAX).contains(&host.len())
+                && host.bytes().all(|b| b.is_ascii_alphanumeric() || b"-._".contains(&b))
+        };
+        match self.hosts.iter().find(|host| !is_name(host)) {
+            None => Ok(()),
+            Some(host) => Err(Error::configuration(format!("web.hosts: {host:?}"))
+                .allowed("names of letters, digits, dots and hyphens, without scheme and port")
+                .remedy("write it as [\"lane3.example.com\"]")),
+        }
+    }
+}

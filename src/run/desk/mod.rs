@@ -1,0 +1,317 @@
+//! The desk: a thread that takes what vision and PLC leave behind, makes pictures of it and puts it up
+//! for the page and into the archive. Nobody waits for it.
+//!
+//! ```text
+//! vision -> [shots] -> desk -> Board: live pictures, parcels, events -> page
+//!    ^-- [empty shots] --'  '-> archive's ring -> archive's thread -> disk
+//! PLC thread -> [published records] --^
+//! ```
+
+mod insight;
+mod lamps;
+mod news;
+mod scene;
+pub mod shots;
+
+pub use insight::{Insight, is_due};
+pub use shots::{Album, Photographer, Rings, Shot};
+
+use super::appliance::Progress;
+use super::realtime;
+use crate::archive::{self, Archive};
+use crate::config::{Config, DimensionOrder, Site};
+use crate::error::{Error, Result};
+use crate::event::ParcelRecord;
+use crate::web::{self, Board, View};
+use heapless::spsc::Consumer;
+use insight::utc_ms;
+use jpeg_encoder::{ColorType, Encoder};
+use news::{News, event};
+use scene::Geometry;
+use serde::Serialize;
+use shots::{Framing, LIVE, Subject};
+use std::collections::VecDeque;
+use std::sync::Arc;
+use std::sync::atomic::Ordering;
+use std::time::{Duration, Instant};
+
+/// The desk looks at what happens this often, woken or not.
+const LOOK: Duration = Duration::from_millis(50);
+/// State and events are looked at this often.
+const NEWS: Duration = Duration::from_millis(200);
+/// The archive takes the last entries within this, or not at all.
+const FAREWELL: Duration = Duration::from_secs(2);
+/// Pictures of parcels that have not been told yet.
+const WAITING_MAX: usize = 64;
+/// A picture belongs to the parcel whose record is of its frame and this near.
+const MATCH_MM: f64 = 100.0;
+/// Qualities of JPEG: what moves, and what is kept.
+const LIVE_QUALITY: u8 = 70;
+const PARCEL_QUALITY: u8 = 80;
+/// Of a parcel's picture this share of the pixels may become white, and as many black.
+const CLIPPED_SHARE: f64 = 0.005;
+
+/// What the desk is told by, and what it tells.
+pub struct Desk<'a> {
+    /// Its side of the pictures.
+    pub album: Album<'a>,
+    /// What the PLC was told.
+    pub published: Consumer<'a, ParcelRecord>,
+    /// What the page asks.
+    pub insight: Arc<Insight>,
+    /// What the page shows.
+    pub board: Arc<Board>,
+    geometry: Geometry,
+    archive: Option<Archive>,
+    config: Config,
+    /// Live shots that are here, and when each kind was last asked for.
+    live: [(Option<Shot>, Option<Instant>); LIVE],
+    waiting: VecDeque<Waiting>,
+    news: News,
+    looked: Option<Instant>,
+}
+
+/// A picture of a parcel that has not been told yet.
+struct Waiting {
+    framing: Framing,
+    sight: crate::pipeline::Sight,
+    jpeg: Vec<u8>,
+}
+
+/// An entry of the archive.
+#[derive(Serialize)]
+struct Kept<'a, T: Serialize> {
+    #[serde(flatten)]
+    what: &'a T,
+    boots: u16,
+    version: &'static str,
+}
+
+/// The board of a machine that starts now.
+pub fn board() -> Arc<Board> {
+    Arc::new(Board::new(utc_ms()))
+}
+
+impl<'a> Desk<'a> {
+    /// Take the shots, start the archive.
+    pub fn new(
+        site: &Site,
+        shots: Vec<Shot>,
+        mut album: Album<'a>,
+        published: Consumer<'a, ParcelRecord>,
+        insight: Arc<Insight>,
+        board: Arc<Board>,
+    ) -> Result<Self> {
+        let config = site.config.clone();
+        let archive = config.archive.folder.as_deref();
+        let bytes_max = (config.archive.mib_max as u64) << 20;
+        let archive = archive.map(|folder| Archive::start(folder, bytes_max)).transpose()?;
+        let mut live = [(None, None), (None, None)];
+        for shot in shots {
+            match shot.framing.subject {
+                Subject::Raw => live[View::Raw as usize].0 = Some(shot),
+                Subject::Belt => live[View::Belt as usize].0 = Some(shot),
+                Subject::Parcel => {
+                    let _ = album.spare.enqueue(shot); // invariant: there is room for all
+                }
+            }
+        }
+        Ok(Self {
+            album,
+            published,
+            insight,
+            board,
+            geometry: Geometry::new(site),
+            archive,
+            config,
+            live,
+            waiting: VecDeque::new(),
+            news: News::new(Instant::now()),
+            looked: None,
+        })
+    }
+
+    /// Until it is over; what came before is told.
+    pub fn run(mut self, progress: &dyn Fn() -> Progress, over: &dyn Fn() -> bool) -> Result<()> {
+        realtime::stand_back();
+        self.board.is_served_here();
+        self.happened(event(utc_ms(), "started", 0, env!("CARGO_PKG_VERSION").to_owned()));
+        loop {
+            // Asked before the rings are emptied.
+            let over = over();
+            self.take_shots()?;
+            while let Some(record) = self.published.dequeue() {
+                self.parcel(record);
+            }
+            let now = Instant::now();
+            if over || self.looked.is_none_or(|at| now - at >= NEWS) {
+                self.looked = Some(now);
+                let condition = self.archive.as_ref().map(Archive::condition);
+                self.insight.desk_tells(progress().frame_time_max, condition);
+                for event in self.news.look(&self.insight.plc_side(), utc_ms(), now) {
+                    self.happened(event);
+                }
+            }
+            if over {
+                break;
+            }
+            std::thread::park_timeout(self.ask(now));
+        }
+        self.happened(event(utc_ms(), "stopped", 0, String::new()));
+        self.board.close();
+        if let Some(archive) = self.archive {
+            archive.finish(FAREWELL);
+        }
+        Ok(())
+    }
+
+    /// Ask for the live pictures that somebody waits for; returns how long to sleep.
+    fn ask(&mut self, now: Instant) -> Duration {
+        let period = Duration::from_secs(1) / self.config.web.pictures_per_s_max.max(1);
+        let mut sleep = LOOK;
+        for view in [View::Raw, View::Belt] {
+            let (shot, asked) = &mut self.live[view as usize];
+            if shot.is_none() || !self.board.is_wanted(view) {
+                continue;
+            }
+            let rest = asked.map_or(Duration::ZERO, |at| period.saturating_sub(now - at));
+            if !rest.is_zero() {
+                sleep = sleep.min(rest);
+            } else if let Some(shot) = shot.take() {
+                *asked = Some(now);
+                let _ = self.album.asked.enqueue(shot); // invariant: there is room for all
+            }
+        }
+        sleep
+    }
+
+    fn take_shots(&mut self) -> Result<()> {
+        while let Some(shot) = self.album.taken.dequeue() {
+            match shot.framing.subject {
+                Subject::Raw => self.put_up(View::Raw, shot)?,
+                Subject::Belt => self.put_up(View::Belt, shot)?,
+                Subject::Parcel => {
+                    self.keep(&shot)?;
+                    let _ = self.album.spare.enqueue(shot); // invariant: there is room for all
+                }
+            }
+        }
+        Ok(())
+    }
+
+    fn put_up(&mut self, view: View, shot: Shot) -> Result<()> {
+        let scene = self.geometry.scene(&shot);
+        let mut bytes = json(&scene)?.into_bytes();
+        bytes.push(b'\n');
+        encode(shot.pixels(), shot.framing.size_px, LIVE_QUALITY, &mut bytes)?;
+        self.board.picture(view, scene.frame, bytes);
+        self.live[view as usize].0 = Some(shot);
+        Ok(())
+    }
+
+    /// Keep the picture of a parcel until it is told.
+    fn keep(&mut self, shot: &Shot) -> Result<()> {
+        let Some(sight) = shot.sights.first() else { return Ok(()) };
+        let mut jpeg = Vec::new();
+        encode(&stretched(shot.pixels()), shot.framing.size_px, PARCEL_QUALITY, &mut jpeg)?;
+        if self.waiting.len() == WAITING_MAX {
+            self.waiting.pop_front();
+        }
+        self.waiting.push_back(Waiting { framing: shot.framing, sight: *sight, jpeg });
+        Ok(())
+    }
+
+    fn picture_of(&mut self, record: &ParcelRecord) -> Option<Waiting> {
+        let candidates = self.waiting.iter().enumerate();
+        let distances = candidates
+            .filter(|(_, waiting)| waiting.framing.time.index == record.frame)
+            .map(|(i, waiting)| (i, self.geometry.distance_mm(&waiting.sight, record)));
+        let (nearest, distance_mm) = distances.min_by(|a, b| a.1.total_cmp(&b.1))?;
+        if distance_mm > MATCH_MM {
+            return None;
+        }
+        self.waiting.remove(nearest)
+    }
+
+    fn parcel(&mut self, record: ParcelRecord) {
+        let waiting = self.picture_of(&record);
+        if waiting.is_none() {
+            self.insight.pictures_missed.fetch_add(1, Ordering::Relaxed);
+        }
+        self.insight.usable.fetch_add(u64::from(record.may_be_used), Ordering::Relaxed);
+        // In descending order it is not known which side is the height.
+        let is_upright = self.config.plc.order != DimensionOrder::Descending;
+        let picture = waiting.as_ref().map(|waiting| web::ParcelPicture {
+            size_px: waiting.framing.size_px,
+            cuboid_px: self.geometry.recorded(&waiting.framing, &record).filter(|_| is_upright),
+        });
+        let jpeg = waiting.map(|waiting| waiting.jpeg).unwrap_or_default();
+        // What the PLC's rounding left behind the last digit is noise.
+        let record = record.rounded();
+        let parcel = web::Parcel { n: 0, utc_ms: utc_ms(), record, picture };
+        let parcel = self.board.parcel(parcel, jpeg.clone());
+        self.archive(archive::Kind::Parcel, parcel.utc_ms, &*parcel, jpeg);
+    }
+
+    fn happened(&self, event: web::Event) {
+        let event = self.board.event(event);
+        self.archive(archive::Kind::Event, event.utc_ms, &*event, Vec::new());
+    }
+
+    fn archive<T: Serialize>(&self, kind: archive::Kind, utc_ms: u64, what: &T, picture: Vec<u8>) {
+        let Some(archive) = &self.archive else { return };
+        let boots = self.insight.plc_side().status.boots;
+        let kept = Kept { what, boots, version: env!("CARGO_PKG_VERSION") };
+        if let Ok(text) = json(&kept) {
+            archive.put(archive::Entry { kind, utc_ms, text, picture });
+        }
+    }
+}
+
+fn json(what: &impl Serialize) -> Result<String> {
+    serde_json::to_string(what).map_err(|e| Error::failure(format!("no JSON: {e}")))
+}
+
+fn encode(pixels: &[u8], size_px: [usize; 2], quality: u8, into: &mut Vec<u8>) -> Result<()> {
+    let [width, height] = size_px.map(|n| n as u16);
+    Encoder::new(into, quality)
+        .encode(pixels, width, height, ColorType::Luma)
+        .map_err(|e| Error::failure(format!("a picture cannot be encoded: {e}")))
+}
+
+/// Raw belts are dark; pictures are for people.
+fn stretched(pixels: &[u8]) -> Vec<u8> {
+    let mut histogram = [0usize; 256];
+    for &grey in pixels {
+        histogram[usize::from(grey)] += 1;
+    }
+    let clipped = (CLIPPED_SHARE * pixels.len() as f64) as usize;
+    let end = |mut greys: Box<dyn Iterator<Item = usize>>| {
+        let mut count = 0;
+        let beyond = |grey: &usize| {
+            count += histogram[*grey];
+            count > clipped
+        };
+        greys.find(beyond).unwrap_or(0)
+    };
+    let (black, white) = (end(Box::new(0..256)), end(Box::new((0..256).rev())));
+    let span = white.saturating_sub(black).max(32);
+    let grey = |grey: usize| (grey.saturating_sub(black) * 255 / span).min(255) as u8;
+    let table: [u8; 256] = std::array::from_fn(grey);
+    pixels.iter().map(|&grey| table[usize::from(grey)]).collect()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_dark_picture_is_stretched_and_a_plain_one_stays_plain() {
+        let dark: Vec<u8> = (0..1000u32).map(|i| 30 + (i % 40) as u8).collect();
+        let bright = stretched(&dark);
+        assert!(bright.iter().max() > Some(&250) && bright.iter().min() < Some(&8));
+        let plain = stretched(&[45; 1000]);
+        assert!(plain.iter().all(|&grey| grey == plain[0]), "noise is not blown up");
+        assert!(stretched(&[]).is_empty());
+    }
+}

@@ -1,0 +1,234 @@
+//! What can be asked for, and the answers.
+
+use super::assets::ASSETS;
+use super::board::{Board, PARCELS_MAX, View};
+use super::guard::{self, Hosts};
+use super::metrics;
+use super::model::{Archived, Event, Machine, Parcel};
+use crate::event::csv;
+use axum::extract::{Path, RawQuery, Request, State};
+use axum::http::{Method, StatusCode, header};
+use axum::middleware::{self, Next};
+use axum::response::{IntoResponse, Response};
+use axum::routing::get;
+use axum::{Json, Router};
+use serde::Serialize;
+use std::sync::Arc;
+use std::time::Duration;
+
+/// A request for a live picture waits this long for one.
+const PICTURE_PATIENCE: Duration = Duration::from_secs(1);
+/// Entries of the archive in one answer.
+const ARCHIVED_MAX: usize = 100;
+/// A number in a query has no more digits.
+const DIGITS_MAX: usize = 20;
+
+/// What the answers are made from.
+#[derive(Clone)]
+struct Sources {
+    board: Arc<Board>,
+    machine: Arc<dyn Machine>,
+}
+
+/// All that is served.
+pub(super) fn router(board: Arc<Board>, machine: Arc<dyn Machine>, hosts: Hosts) -> Router {
+    let mut router = Router::new();
+    for (path, kind, bytes) in ASSETS {
+        let asset = move || async move { ([(header::CONTENT_TYPE, *kind)], *bytes) };
+        router = router.route(path, get(asset));
+    }
+    router
+        .route("/api/state", get(state))
+        .route("/api/plc", get(plc))
+        .route("/api/parcels", get(parcels))
+        .route("/api/parcels.csv", get(parcels_csv))
+        .route("/api/parcels/{n}/picture", get(parcel_picture))
+        .route("/api/events", get(events))
+        .route("/api/live/{view}", get(live))
+        .route("/api/archive", get(archive))
+        .route("/api/archive/{entry}/picture", get(archive_picture))
+        .route("/metrics", get(metrics))
+        .fallback(|| async { refusal(StatusCode::NOT_FOUND, "there is no such page") })
+        .layer(middleware::from_fn_with_state(hosts, admit))
+        .with_state(Sources { board, machine })
+}
+
+/// An answer that says what was wrong.
+fn refusal(status: StatusCode, text: &'static str) -> Response {
+    (status, text).into_response()
+}
+
+/// Turn away who may not ask, and tell browsers what they may do with the answer.
+async fn admit(State(hosts): State<Hosts>, request: Request, next: Next) -> Response {
+    let mut answer = if !hosts.admit(&request) {
+        let text = "this machine is not called so: ask for it by its address, or put the name into web.hosts";
+        refusal(StatusCode::MISDIRECTED_REQUEST, text)
+    } else if !matches!(*request.method(), Method::GET | Method::HEAD) {
+        refusal(StatusCode::METHOD_NOT_ALLOWED, "nothing can be changed here: only GET is answered")
+    } else {
+        next.run(request).await
+    };
+    guard::protect(answer.headers_mut());
+    answer
+}
+
+/// A number in a query is none.
+struct NoNumber;
+
+impl From<NoNumber> for Response {
+    fn from(_: NoNumber) -> Self {
+        refusal(StatusCode::BAD_REQUEST, "a number in the query is none: write it in digits")
+    }
+}
+
+/// A number in a query, as in `since=12&limit=5`.
+fn number(query: Option<&str>, name: &str) -> Result<Option<u64>, NoNumber> {
+    let mut pairs = query.unwrap_or_default().split('&').filter_map(|pair| pair.split_once('='));
+    let Some((_, text)) = pairs.find(|(key, _)| *key == name) else { return Ok(None) };
+    let is_number =
+        (1..=DIGITS_MAX).contains(&text.len()) && text.bytes().all(|b| b.is_ascii_digit());
+    match text.parse() {
+        Ok(number) if is_number => Ok(Some(number)),
+        _ => Err(NoNumber),
+    }
+}
+
+async fn state(State(from): State<Sources>) -> Response {
+    Json(from.machine.state()).into_response()
+}
+
+async fn plc(State(from): State<Sources>) -> Response {
+    Json(from.machine.plc()).into_response()
+}
+
+async fn metrics(State(from): State<Sources>) -> Response {
+    let text = metrics::text(&from.machine.state());
+    ([(header::CONTENT_TYPE, metrics::CONTENT_TYPE)], text).into_response()
+}
+
+/// A part of a list, and where it goes on.
+#[derive(Serialize)]
+struct Listed<'a, T> {
+    /// Number of this run: when it changes, numbers begin anew.
+    run: u64,
+    items: Vec<&'a T>,
+    /// Ask for what comes after it with `since`.
+    next: u64,
+}
+
+fn listed<T: Serialize>(
+    board: &Board,
+    items: &[Arc<T>],
+    since: u64,
+    n: impl Fn(&T) -> u64,
+) -> Response {
+    let next = items.last().map_or(since, |item| n(item));
+    let items = items.iter().map(|item| &**item).collect();
+    Json(Listed { run: board.started_ms(), items, next }).into_response()
+}
+
+async fn parcels(
+    State(from): State<Sources>,
+    RawQuery(query): RawQuery,
+) -> Result<Response, Response> {
+    let since = number(query.as_deref(), "since")?.unwrap_or(0);
+    let limit = number(query.as_deref(), "limit")?.map_or(PARCELS_MAX, |n| n as usize);
+    let items = from.board.parcels_since(since, limit);
+    Ok(listed(&from.board, &items, since, |parcel: &Parcel| parcel.n))
+}
+
+/// The last parcels, for a spreadsheet.
+async fn parcels_csv(State(from): State<Sources>) -> Response {
+    let state = from.machine.state();
+    let mut text = csv::header("n");
+    for parcel in from.board.parcels_since(0, PARCELS_MAX) {
+        let mut record = serde_json::to_value(&*parcel).unwrap_or_default();
+        if let Some(record) = record.as_object_mut() {
+            record.insert("boots".to_owned(), state.boots.into());
+            record.insert("version".to_owned(), state.version.into());
+        }
+        text.push('\n');
+        text.push_str(&csv::line(parcel.n, parcel.utc_ms, &record));
+    }
+    text.push('\n');
+    let headers = [
+        (header::CONTENT_TYPE, "text/csv; charset=utf-8"),
+        (header::CONTENT_DISPOSITION, "attachment; filename=\"parcels.csv\""),
+    ];
+    (headers, text).into_response()
+}
+
+async fn events(
+    State(from): State<Sources>,
+    RawQuery(query): RawQuery,
+) -> Result<Response, Response> {
+    let since = number(query.as_deref(), "since")?.unwrap_or(0);
+    let items = from.board.events_since(since);
+    Ok(listed(&from.board, &items, since, |event: &Event| event.n))
+}
+
+async fn parcel_picture(State(from): State<Sources>, Path(n): Path<String>) -> Response {
+    jpeg(n.parse().ok().and_then(|n| from.board.parcel_picture(n)))
+}
+
+fn jpeg(bytes: Option<impl IntoResponse>) -> Response {
+    match bytes {
+        Some(bytes) => ([(header::CONTENT_TYPE, "image/jpeg")], bytes).into_response(),
+        None => refusal(StatusCode::NOT_FOUND, "there is no such picture, or no longer"),
+    }
+}
+
+/// A line of JSON that describes the picture, then the picture, a JPEG.
+async fn live(
+    State(from): State<Sources>,
+    Path(view): Path<String>,
+    RawQuery(query): RawQuery,
+) -> Result<Response, Response> {
+    let view = match view.as_str() {
+        "belt" => View::Belt,
+        "raw" => View::Raw,
+        _ => return Err(refusal(StatusCode::NOT_FOUND, "the views are belt and raw")),
+    };
+    let shown = number(query.as_deref(), "after")?;
+    let next = from.board.next_picture(view, shown);
+    Ok(match tokio::time::timeout(PICTURE_PATIENCE, next).await {
+        Ok(picture) => {
+            let kind = [(header::CONTENT_TYPE, "application/octet-stream")];
+            (kind, picture.bytes.clone()).into_response()
+        }
+        Err(_) => StatusCode::NO_CONTENT.into_response(),
+    })
+}
+
+/// Ask the disk on a thread that may wait for it.
+async fn read<T: Send + 'static>(
+    from: &Sources,
+    read: impl FnOnce(&dyn Machine) -> T + Send + 'static,
+) -> Result<T, Response> {
+    let machine = Arc::clone(&from.machine);
+    let failed = |_| refusal(StatusCode::INTERNAL_SERVER_ERROR, "the archive was not read");
+    tokio::task::spawn_blocking(move || read(&*machine)).await.map_err(failed)
+}
+
+async fn archive(
+    State(from): State<Sources>,
+    RawQuery(query): RawQuery,
+) -> Result<Response, Response> {
+    let before = number(query.as_deref(), "before")?;
+    let limit = number(query.as_deref(), "limit")?.map_or(ARCHIVED_MAX, |n| n as usize);
+    let limit = limit.min(ARCHIVED_MAX);
+    let archived: Result<Archived, String> =
+        read(&from, move |machine| machine.archived(before, limit)).await?;
+    Ok(match archived {
+        Ok(archived) => Json(archived).into_response(),
+        Err(why) => (StatusCode::SERVICE_UNAVAILABLE, why).into_response(),
+    })
+}
+
+async fn archive_picture(
+    State(from): State<Sources>,
+    Path(entry): Path<String>,
+) -> Result<Response, Response> {
+    let Ok(entry) = entry.parse() else { return Ok(jpeg(None::<Vec<u8>>)) };
+    Ok(jpeg(read(&from, move |machine| machine.archived_picture(entry)).await?))
+}

@@ -1,0 +1,24 @@
+//! The page itself: one HTML, one style sheet, a few modules, the texts; all in the binary.
+
+/// What a browser takes it for.
+const HTML: &str = "text/html; charset=utf-8";
+const CSS: &str = "text/css; charset=utf-8";
+const SCRIPT: &str = "text/javascript; charset=utf-8";
+const JSON: &str = "application/json";
+const SVG: &str = "image/svg+xml";
+
+/// Path, type and bytes of each.
+pub(super) const ASSETS: &[(&str, &str, &[u8])] = &[
+    ("/", HTML, include_bytes!("page/index.html")),
+    ("/style.css", CSS, include_bytes!("page/style.css")),
+    ("/icon.svg", SVG, include_bytes!("page/icon.svg")),
+    ("/main.js", SCRIPT, include_bytes!("page/main.js")),
+    ("/common.js", SCRIPT, include_bytes!("page/common.js")),
+    ("/live.js", SCRIPT, include_bytes!("page/live.js")),
+    ("/overview.js", SCRIPT, include_bytes!("page/overview.js")),
+    ("/parcels.js", SCRIPT, include_bytes!("page/parcels.js")),
+    ("/plc.js", SCRIPT, include_bytes!("page/plc.js")),
+    ("/events.js", SCRIPT, include_bytes!("page/events.js")),
+    ("/en.json", JSON, include_bytes!("page/en.json")),
+    ("/de.json", JSON, include_bytes!("page/de.json")),
+];

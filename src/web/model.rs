@@ -1,0 +1,283 @@
+//! What the pages show, as JSON has it.
+
+use crate::event::ParcelRecord;
+use serde::Serialize;
+
+/// A point of a picture: column and row, in its pixels.
+pub type Px = [f32; 2];
+
+/// Base and top of a cuboid in a picture: four corners each, around it in the same order.
+pub type Cuboid = [Px; 8];
+
+/// What the machine tells when it is asked.
+pub trait Machine: Send + Sync + 'static {
+    /// Its state.
+    fn state(&self) -> State;
+    /// What the PLC reads and writes.
+    fn plc(&self) -> Plc;
+    /// So many entries of the archive before one, newest first; before none: the newest. May wait for
+    /// the disk.
+    fn archived(&self, before: Option<u64>, limit: usize) -> Result<Archived, String>;
+    /// The picture of an entry of the archive. May wait for the disk.
+    fn archived_picture(&self, entry: u64) -> Option<Vec<u8>>;
+}
+
+/// The machine's state.
+#[derive(Clone, Debug, Default, Serialize)]
+pub struct State {
+    /// Version of the program.
+    pub version: &'static str,
+    /// The machine's clock, ms since 1970.
+    pub utc_ms: u64,
+    /// Since start.
+    pub uptime_s: f64,
+    /// Starts of the appliance; 0: it keeps none.
+    pub boots: u16,
+    /// Four lamps.
+    pub lamps: Vec<Lamp>,
+    /// Codes of all that is wrong or worth knowing, what matters most first.
+    pub reasons: Vec<u16>,
+    /// The empty belt has been learned.
+    pub ready: bool,
+    /// Parcels are not reported, by command.
+    pub stopped: bool,
+    /// The camera.
+    pub camera: CameraState,
+    /// The belt.
+    pub belt: BeltState,
+    /// What happened so far.
+    pub counts: Counts,
+    /// The archive.
+    pub archive: ArchiveState,
+}
+
+/// A lamp.
+#[derive(Clone, Debug, Serialize)]
+pub struct Lamp {
+    /// `running`, `uncertain`, `maintenance` or `failure`.
+    pub name: &'static str,
+    /// It is lit.
+    pub on: bool,
+    /// Codes of the reasons why; of `running`: why not.
+    pub reasons: Vec<u16>,
+}
+
+/// The camera and its frames.
+#[derive(Clone, Debug, Default, Serialize)]
+pub struct CameraState {
+    /// It is there and does what it was asked for.
+    pub present: bool,
+    /// How often it was lost.
+    pub losses: u64,
+    /// Columns and rows.
+    pub size_px: [usize; 2],
+    /// Frames processed.
+    pub frames: u64,
+    /// Frames that came too late.
+    pub frames_dropped: u64,
+    /// Frames that never came.
+    pub frames_lost: u64,
+    /// Frames that came with parts missing.
+    pub frames_torn: u64,
+    /// The slowest frame in the pipeline.
+    pub frame_time_max_ms: f64,
+}
+
+/// The belt.
+#[derive(Clone, Debug, Default, Serialize)]
+pub struct BeltState {
+    /// Its speed.
+    pub speed_mm_per_s: f64,
+    /// As configured.
+    pub nominal_mm_per_s: f64,
+    /// It is measured, not assumed.
+    pub measured: bool,
+    /// By the encoder.
+    pub by_encoder: bool,
+    /// Since start.
+    pub travel_mm: f64,
+    /// What the pictures show; negative: against +X.
+    pub seen_mm_per_s: Option<f64>,
+    /// The encoder's travel over that of the texture.
+    pub encoder_ratio: Option<f64>,
+}
+
+/// What happened since start.
+#[derive(Clone, Debug, Default, Serialize)]
+pub struct Counts {
+    /// Parcels reported, measured or not.
+    pub parcels: u64,
+    /// Of these, parcels without dimensions.
+    pub parcels_unmeasured: u64,
+    /// Of these, parcels whose dimensions may be used.
+    pub parcels_usable: u64,
+    /// Parcels that vanished inside the view.
+    pub parcels_lost: u64,
+    /// Parcels that left the PLC's queue without having been acknowledged.
+    pub queue_overflows: u64,
+    /// Times that a table was full: runs or blobs, tracks, records.
+    pub table_overflows: [u64; 3],
+    /// Parcels without a picture, because too many came at once.
+    pub pictures_missed: u64,
+    /// Parcels that page and archive were not told of, because too many came at once.
+    pub parcels_missed: u64,
+    /// Lines of the log that nobody read.
+    pub log_lines_dropped: u64,
+}
+
+/// The archive.
+#[derive(Clone, Debug, Default, Serialize)]
+pub struct ArchiveState {
+    /// There is one.
+    pub enabled: bool,
+    /// Entries written since start.
+    pub entries_written: u64,
+    /// Entries that found the disk slow, full or failing.
+    pub entries_lost: u64,
+    /// Bytes on the disk.
+    pub bytes: u64,
+    /// It takes no more.
+    pub bytes_max: u64,
+    /// Why it cannot be written at present.
+    pub fault: Option<String>,
+}
+
+/// A parcel as it was told to the PLC.
+#[derive(Clone, Debug, Serialize)]
+pub struct Parcel {
+    /// Its number on this list, from 1 at start.
+    pub n: u64,
+    /// When it was told, ms since 1970.
+    pub utc_ms: u64,
+    /// The record.
+    #[serde(flatten)]
+    pub record: ParcelRecord,
+    /// Its picture, if there is one.
+    pub picture: Option<ParcelPicture>,
+}
+
+/// What belongs to a parcel's picture.
+#[derive(Clone, Debug, Serialize)]
+pub struct ParcelPicture {
+    /// Columns and rows.
+    pub size_px: [usize; 2],
+    /// The record's cuboid in it.
+    pub cuboid_px: Option<Cuboid>,
+}
+
+/// Something that happened.
+#[derive(Clone, Debug, Serialize)]
+pub struct Event {
+    /// Its number on this list, from 1 at start.
+    pub n: u64,
+    /// When, ms since 1970.
+    pub utc_ms: u64,
+    /// What: `started`, `stopped`, `began` and `ended` (of the reason `code`), `camera_lost`, `command`,
+    /// `import`.
+    pub kind: &'static str,
+    /// Which.
+    pub code: u32,
+    /// Who or what, in the machine's words.
+    pub detail: String,
+}
+
+/// Entries of the archive.
+#[derive(Clone, Debug, Default, Serialize)]
+pub struct Archived {
+    /// Newest first: number, time, kind and what was written.
+    pub entries: Vec<serde_json::Value>,
+    /// Ask for what is before this one; none: there is no more.
+    pub before: Option<u64>,
+}
+
+/// The PLC's side.
+#[derive(Clone, Debug, Default, Serialize)]
+pub struct Plc {
+    /// Version of the map.
+    pub map_version: String,
+    /// Address of the map's first register.
+    pub base_address: u16,
+    /// What it reads of the machine's state.
+    pub status: Vec<Field>,
+    /// What it writes.
+    pub command: Vec<Field>,
+    /// The latest parcel.
+    pub latest: Vec<Field>,
+    /// Who wrote last, and when.
+    pub written: Option<Written>,
+    /// Who is connected.
+    pub clients: Vec<Client>,
+    /// The CAN interface, if there is one.
+    pub can_interface: Option<String>,
+}
+
+/// A value in the registers.
+#[derive(Clone, Debug, Serialize)]
+pub struct Field {
+    /// Address of its first register.
+    pub address: u16,
+    /// Name in the map.
+    pub name: &'static str,
+    /// In its unit.
+    pub value: f64,
+    /// Its registers.
+    pub registers: Vec<u16>,
+    /// Unit.
+    pub unit: &'static str,
+    /// Decimal places that its registers can hold.
+    pub digits: u8,
+    /// Meaning.
+    pub meaning: &'static str,
+}
+
+/// A write.
+#[derive(Clone, Debug, Serialize)]
+pub struct Written {
+    /// Who.
+    pub sender: String,
+    /// How long ago.
+    pub seconds_ago: f64,
+}
+
+/// A Modbus client.
+#[derive(Clone, Debug, Serialize)]
+pub struct Client {
+    /// Address and port.
+    pub address: String,
+    /// Whole requests so far.
+    pub requests: u32,
+    /// Since the last one.
+    pub silent_s: f64,
+    /// It may write.
+    pub may_write: bool,
+}
+
+/// What is drawn over a live picture: of the same frame.
+#[derive(Clone, Debug, Serialize)]
+pub struct Scene {
+    /// Number of the frame.
+    pub frame: u64,
+    /// Its time from the first frame.
+    pub t_s: f64,
+    /// Columns and rows.
+    pub size_px: [usize; 2],
+    /// The zone's border.
+    pub zone_px: Vec<Px>,
+    /// Lines of the grid on the belt, with what they are labelled by: `x` or `y`, and mm.
+    pub grid_px: Vec<(char, f64, Vec<Px>)>,
+    /// The belt's direction: from, to.
+    pub travel_px: [Px; 2],
+    /// Parcels.
+    pub parcels: Vec<Sight>,
+}
+
+/// A parcel in a live picture.
+#[derive(Clone, Debug, Serialize)]
+pub struct Sight {
+    /// `candidate`, `riding` or `told`.
+    pub phase: &'static str,
+    /// Border of its image.
+    pub bounds_px: Vec<Px>,
+    /// Its cuboid as estimated so far.
+    pub cuboid_px: Option<Cuboid>,
+}

@@ -1,0 +1,83 @@
+// The frame around the pages: navigation, lamps, language, theme.
+
+import { askJson, chooseLanguage, count, every, h, number, otherLanguage, remember, remembered, t, time, whenSilent } from "./common.js";
+import { events } from "./events.js";
+import { overview } from "./overview.js";
+import { parcel, parcels } from "./parcels.js";
+import { plc } from "./plc.js";
+
+const PAGES = { overview, parcels, plc, events };
+// One of a list is part of it.
+const OTHERS = { parcel };
+const LIST_OF = { parcel: "parcels" };
+const THEMES = ["auto", "light", "dark"];
+const element = (id) => document.getElementById(id);
+let leave = new AbortController();
+let newest = null;
+let theme = THEMES.includes(remembered("theme")) ? remembered("theme") : "auto";
+
+function showTheme() {
+  if (theme === "auto") delete document.documentElement.dataset.theme;
+  else document.documentElement.dataset.theme = theme;
+  element("theme").textContent = t(`theme.${theme}`);
+  element("theme").title = t("theme.hint");
+}
+
+function showLamps(state) {
+  element("lamps").replaceChildren(...state.lamps.map((lamp) =>
+    h("li", { class: `${lamp.name} ${lamp.on ? "on" : ""}`, title: lamp.reasons.map((code) => t(`reason.${code}`)).join("\n") },
+      h("span", { class: "dot", "aria-hidden": "true" }),
+      `${t(`lamp.${lamp.name}`)}`,
+      h("span", { class: "soft" }, lamp.on ? t("lamp.on") : t("lamp.off")))));
+  element("footer").textContent = t("footer", {
+    version: state.version, clock: time(state.utc_ms), hours: number(state.uptime_s / 3600, 1), boots: count(state.boots),
+  });
+}
+
+function show() {
+  const [name, ...where] = location.hash.slice(1).split("/");
+  const all = { ...PAGES, ...OTHERS };
+  const page = Object.hasOwn(all, name) ? name : "overview";
+  leave.abort();
+  leave = new AbortController();
+  element("dialog").close();
+  element("nav").replaceChildren(...Object.keys(PAGES).map((key) =>
+    h("a", { href: `#${key}`, "aria-current": key === (LIST_OF[page] ?? page) ? "page" : null }, t(`page.${key}`))));
+  document.title = `Beltgauge – ${t(`page.${page}`)}`;
+  element("language").textContent = t("language.other");
+  element("language").lang = otherLanguage();
+  showTheme();
+  const main = element("main");
+  main.replaceChildren(h("h1", {}, t(`page.${page}`)));
+  all[page](main, leave.signal, where);
+  // What is known is shown at once, in the language that was chosen.
+  if (newest) tell(newest);
+}
+
+function tell(state) {
+  newest = state;
+  showLamps(state);
+  document.dispatchEvent(new CustomEvent("state", { detail: state }));
+}
+
+element("theme").addEventListener("click", () => {
+  theme = THEMES[(THEMES.indexOf(theme) + 1) % THEMES.length];
+  remember("theme", theme);
+  showTheme();
+});
+element("language").addEventListener("click", async () => {
+  await chooseLanguage(otherLanguage());
+  show();
+});
+window.addEventListener("hashchange", () => {
+  show();
+  element("main").focus();
+});
+whenSilent((since) => {
+  element("offline").hidden = since === null;
+  if (since !== null) element("offline").textContent = t("offline", { since: time(since) });
+});
+
+await chooseLanguage();
+show();
+every(1000, new AbortController().signal, async () => tell(await askJson("/api/state")));

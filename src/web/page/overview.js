@@ -1,0 +1,62 @@
+// The first page: live picture, lamps in words, the last parcels, figures.
+
+import { bytes, count, h, number, t } from "./common.js";
+import { live } from "./live.js";
+import { parcelTable } from "./parcels.js";
+
+export function overview(main, signal) {
+  const reasons = h("ul", { class: "reasons" });
+  const figures = h("dl", { class: "figures" });
+  main.append(
+    h("div", { class: "columns" }, live(signal),
+      h("div", { class: "stack" },
+        h("section", { class: "card", "aria-live": "polite" }, h("h2", {}, t("overview.state")), reasons),
+        h("section", { class: "card" }, h("h2", {}, t("overview.figures")), figures))),
+    parcelTable(signal, { title: t("overview.parcels"), most: 8, filters: false }));
+  document.addEventListener("state", ({ detail }) => {
+    const words = explained(detail);
+    // A screen reader reads it when it changes, not every second.
+    if (reasons.dataset.shown !== words.key) {
+      reasons.dataset.shown = words.key;
+      reasons.replaceChildren(...words.items);
+    }
+    figures.replaceChildren(...figuresOf(detail));
+  }, { signal });
+}
+
+function explained(state) {
+  const items = [];
+  const told = new Set();
+  for (const lamp of [...state.lamps].reverse()) {
+    for (const code of lamp.reasons.filter((code) => !told.has(code))) {
+      told.add(code);
+      items.push(h("li", { class: lamp.on ? lamp.name : "" }, h("b", {}, t(`reason.${code}`)), h("span", {}, t(`remedy.${code}`))));
+    }
+  }
+  if (state.archive.fault !== null) {
+    told.add("archive");
+    items.push(h("li", { class: "maintenance" }, h("b", {}, t("archive.fault")), h("span", {}, `${state.archive.fault}. ${t("archive.remedy")}`)));
+  }
+  if (items.length === 0) items.push(h("li", { class: "running" }, h("b", {}, t("reason.0")), h("span", {}, t("remedy.0"))));
+  return { key: `${[...told].join()} ${state.archive.fault} ${document.documentElement.lang}`, items };
+}
+
+function figuresOf(state) {
+  const { camera, belt, counts, archive } = state;
+  const speed = belt.by_encoder ? "figure.by_encoder" : belt.measured ? "figure.by_texture" : "figure.assumed";
+  const figures = [
+    ["figure.speed", `${number(belt.speed_mm_per_s)} mm/s (${t(speed)})`],
+    ["figure.parcels", count(counts.parcels)],
+    ["figure.usable", count(counts.parcels_usable)],
+    ["figure.unmeasured", count(counts.parcels_unmeasured)],
+    ["figure.frames", count(camera.frames)],
+    ["figure.dropped", `${count(camera.frames_dropped)} / ${count(camera.frames_lost)} / ${count(camera.frames_torn)}`],
+    ["figure.slowest", `${number(camera.frame_time_max_ms)} ms`],
+    ["figure.camera", `${camera.size_px.join(" × ")} px`],
+    ["figure.losses", count(camera.losses)],
+  ];
+  if (belt.encoder_ratio !== null) figures.push(["figure.encoder_ratio", number(belt.encoder_ratio, 4)]);
+  figures.push(["figure.archive", archive.enabled ? t("figure.archive_used", { used: bytes(archive.bytes), most: bytes(archive.bytes_max) }) : t("figure.archive_none")]);
+  if (archive.entries_lost > 0) figures.push(["figure.archive_lost", count(archive.entries_lost)]);
+  return figures.map(([key, value]) => h("div", {}, h("dt", {}, t(key)), h("dd", {}, value)));
+}

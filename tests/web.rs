@@ -1,0 +1,430 @@
+//! The page's server as strangers meet it, and the page's texts.
+
+use beltgauge::config::Web;
+use beltgauge::event::{Flags, NotMeasured, ParcelRecord, Shape};
+use beltgauge::plc::command::COMMANDS;
+use beltgauge::plc::registers::REASONS;
+use beltgauge::web::{self, Archived, Board, Event, Machine, Parcel, Plc, State, View};
+use std::collections::{BTreeMap, BTreeSet};
+use std::io::{ErrorKind, Read, Write};
+use std::net::{SocketAddr, TcpStream};
+use std::path::Path;
+use std::sync::Arc;
+use std::time::{Duration, Instant};
+
+/// Nothing a test waits for takes longer.
+const PATIENCE: Duration = Duration::from_secs(30);
+
+struct Still;
+
+impl Machine for Still {
+    fn state(&self) -> State {
+        State { version: "1.2.3", ..State::default() }
+    }
+    fn plc(&self) -> Plc {
+        Plc::default()
+    }
+    fn archived(&self, before: Option<u64>, limit: usize) -> Result<Archived, String> {
+        let last = before.unwrap_or(1000);
+        let entries = (0..limit as u64).map(|i| serde_json::json!(last - 1 - i)).collect();
+        Ok(Archived { entries, before: Some(last - limit as u64) })
+    }
+    fn archived_picture(&self, entry: u64) -> Option<Vec<u8>> {
+        (entry == 7).then(|| b"jpeg".to_vec())
+    }
+}
+
+struct Server {
+    address: SocketAddr,
+    board: Arc<Board>,
+    thread: Option<std::thread::JoinHandle<()>>,
+}
+
+impl Server {
+    fn start() -> Self {
+        let settings = Web { address: [127, 0, 0, 1].into(), port: 0, ..Web::default() };
+        let listening = web::listen(&settings);
+        let address = listening.as_ref().expect("bound").local_addr().expect("bound");
+        let board = Arc::new(Board::new(5));
+        let served = Arc::clone(&board);
+        let thread = std::thread::spawn(move || {
+            web::serve(&settings, listening, &served, Arc::new(Still)).expect("serves");
+        });
+        Self { address, board, thread: Some(thread) }
+    }
+
+    fn connect(&self) -> TcpStream {
+        let stream = TcpStream::connect(self.address).expect("listens");
+        stream.set_read_timeout(Some(PATIENCE)).expect("a time");
+        stream
+    }
+
+    /// Send bytes, return what is answered until the connection ends.
+    fn send(&self, bytes: &[u8]) -> String {
+        let mut stream = self.connect();
+        // It may be hung up on while it still talks.
+        let _ = stream.write_all(bytes);
+        let mut answer = Vec::new();
+        let _ = stream.read_to_end(&mut answer);
+        String::from_utf8_lossy(&answer).into_owned()
+    }
+
+    fn get(&self, path: &str) -> String {
+        self.send(
+            format!("GET {path} HTTP/1.1\r\nHost: localhost\r\nConnection: close\r\n\r\n")
+                .as_bytes(),
+        )
+    }
+}
+
+impl Drop for Server {
+    fn drop(&mut self) {
+        self.board.close();
+        if let Some(thread) = self.thread.take() {
+            assert!(thread.join().is_ok() || std::thread::panicking());
+        }
+    }
+}
+
+fn status(answer: &str) -> u16 {
+    let code = answer.split(' ').nth(1).and_then(|code| code.parse().ok());
+    code.unwrap_or_else(|| panic!("no answer: {answer:?}"))
+}
+
+fn body(answer: &str) -> serde_json::Value {
+    let (_, body) = answer.split_once("\r\n\r\n").expect("an answer");
+    serde_json::from_str(body).expect("JSON")
+}
+
+#[test]
+fn what_is_there_is_served_and_every_answer_is_protected() {
+    let server = Server::start();
+    for (path, expected) in [
+        ("/", 200),
+        ("/main.js", 200),
+        ("/de.json", 200),
+        ("/metrics", 200),
+        ("/api/state", 200),
+        ("/api/plc", 200),
+        ("/api/parcels", 200),
+        ("/api/parcels?since=3&limit=2", 200),
+        ("/api/events?since=18446744073709551615", 200),
+        ("/api/archive?before=500&limit=5", 200),
+        ("/api/archive/7/picture", 200),
+        ("/api/archive/8/picture", 404),
+        ("/api/archive/x/picture", 404),
+        ("/api/parcels.csv", 200),
+        ("/api/parcels/1/picture", 404),
+        ("/api/parcels/-1/picture", 404),
+        ("/api/live/up", 404),
+        ("/api/live/belt?after=x", 400),
+        ("/api/parcels?since=-1", 400),
+        ("/api/parcels?since=%31", 400),
+        ("/api/parcels?limit=99999999999999999999999", 400),
+        ("/../../etc/passwd", 404),
+        ("/..%2f..%2fetc%2fpasswd", 404),
+        ("/api/archive/..%2f..%2f/picture", 404),
+        ("//evil.example.com/", 404),
+        ("/index.html", 404),
+    ] {
+        let answer = server.get(path);
+        assert_eq!(status(&answer), expected, "{path}");
+        let head = answer.to_lowercase();
+        for header in [
+            "content-security-policy: default-src 'none'",
+            "x-content-type-options: nosniff",
+            "cache-control: no-store",
+        ] {
+            assert!(head.contains(header), "{path} lacks {header}");
+        }
+        assert!(!answer.contains("root:"), "{path}");
+    }
+    let archived = body(&server.get("/api/archive?limit=1000000"));
+    assert_eq!(
+        archived["entries"].as_array().map(Vec::len),
+        Some(100),
+        "however many are asked for"
+    );
+}
+
+#[test]
+fn nothing_can_be_changed_and_another_name_gets_nothing() {
+    let server = Server::start();
+    for method in ["POST", "PUT", "DELETE", "PATCH", "OPTIONS", "CONNECT", "BREW"] {
+        let request =
+            format!("{method} /api/state HTTP/1.1\r\nHost: localhost\r\nConnection: close\r\n\r\n");
+        let answer = server.send(request.as_bytes());
+        assert!((400..500).contains(&status(&answer)), "{method}");
+        assert!(!answer.contains("1.2.3"), "{method}");
+    }
+    for host in ["Host: evil.example.com\r\n", "", "Host: localhost\r\nHost: evil.example.com\r\n"]
+    {
+        let request = format!("GET /api/state HTTP/1.1\r\n{host}Connection: close\r\n\r\n");
+        let answer = server.send(request.as_bytes());
+        assert!((400..500).contains(&status(&answer)) && !answer.contains("1.2.3"), "{host:?}");
+    }
+}
+
+#[test]
+fn what_is_too_large_or_no_http_is_turned_away() {
+    let server = Server::start();
+    let long = "a".repeat(1 << 20);
+    for request in [
+        format!("GET /{long} HTTP/1.1\r\nHost: localhost\r\n\r\n"),
+        format!("GET / HTTP/1.1\r\nHost: localhost\r\nX: {long}\r\n\r\n"),
+        format!("GET / HTTP/1.1\r\nHost: localhost\r\n{}\r\n", "X: y\r\n".repeat(1000)),
+        "\u{16}\u{3}\u{1}\u{2}\u{0}".to_owned(),
+    ] {
+        let answer = server.send(request.as_bytes());
+        assert!(answer.is_empty() || (400..500).contains(&status(&answer)), "{answer:.60}");
+    }
+    // A body is not waited for, nor taken.
+    let request =
+        format!("POST / HTTP/1.1\r\nHost: localhost\r\nContent-Length: 9999999999\r\n\r\n{long}");
+    let answer = server.send(request.as_bytes());
+    assert!(answer.is_empty() || status(&answer) == 405, "{answer:.60}");
+    assert_eq!(status(&server.get("/api/state")), 200, "it serves on");
+}
+
+#[test]
+fn one_address_has_half_of_the_places_and_gets_them_back() {
+    let server = Server::start();
+    let half = Web::default().connections_max / 2;
+    let mut open: Vec<TcpStream> = (0..half).map(|_| server.connect()).collect();
+    // They are inside when they are answered.
+    for stream in &mut open {
+        stream.write_all(b"GET /api/plc HTTP/1.1\r\nHost: localhost\r\n\r\n").expect("open");
+        let mut some = [0; 16];
+        stream.read_exact(&mut some).expect("answered");
+    }
+    let refused = server.send(b"GET /api/plc HTTP/1.1\r\nHost: localhost\r\n\r\n");
+    assert!(refused.is_empty(), "one too many is hung up on: {refused}");
+    drop(open);
+    let start = Instant::now();
+    while server.get("/api/plc").is_empty() {
+        assert!(start.elapsed() < PATIENCE, "the places are not given back");
+    }
+}
+
+/// A connection from another address of this machine.
+fn connect_from(local: [u8; 4], server: SocketAddr) -> TcpStream {
+    use rustix::net::{AddressFamily, SocketType, bind, connect, socket};
+    let socket = socket(AddressFamily::INET, SocketType::STREAM, None).expect("a socket");
+    bind(&socket, &SocketAddr::from((local, 0))).expect("all of 127 is this machine");
+    connect(&socket, &server).expect("listens");
+    let stream = TcpStream::from(socket);
+    stream.set_read_timeout(Some(PATIENCE)).expect("a time");
+    stream
+}
+
+#[test]
+fn of_a_hundred_at_once_as_many_are_served_as_have_places_and_others_find_one() {
+    const ASKED: &[u8] = b"GET /api/state HTTP/1.1\r\nHost: localhost\r\n\r\n";
+    let server = Server::start();
+    let mut crowd: Vec<TcpStream> = (0..100).map(|_| server.connect()).collect();
+    let is_served = |stream: &mut TcpStream| {
+        let mut some = [0; 12];
+        // One too many may be hung up on while it talks.
+        stream.write_all(ASKED).and_then(|()| stream.read_exact(&mut some)).is_ok()
+            && some == *b"HTTP/1.1 200"
+    };
+    // All of them stay: who was served has not given its place back.
+    let served = crowd.iter_mut().map(is_served).filter(|served| *served).count();
+    assert_eq!(served, Web::default().connections_max / 2);
+    let mut other = connect_from([127, 0, 0, 2], server.address);
+    assert!(is_served(&mut other), "another visitor is locked out");
+}
+
+#[test]
+fn who_asks_a_byte_at_a_time_is_ended_and_others_are_served() {
+    let server = Server::start();
+    let mut slow = server.connect();
+    let start = Instant::now();
+    // A head that never ends: no byte is late, the whole is.
+    slow.write_all(b"GET / HTTP/1.1\r\nHost: localhost\r\nX: ").expect("open");
+    while slow.write_all(b"x").is_ok() {
+        assert!(start.elapsed() < PATIENCE, "it is waited for");
+        assert_eq!(status(&server.get("/api/state")), 200, "others are served meanwhile");
+        std::thread::sleep(Duration::from_millis(100));
+    }
+}
+
+#[test]
+fn who_asks_and_takes_no_answer_is_ended_and_others_are_served() {
+    let server = Server::start();
+    let mut deaf = server.connect();
+    deaf.set_write_timeout(Some(PATIENCE)).expect("a time");
+    // When nothing is taken the server stops to read, and then this stops to write.
+    let end = loop {
+        if let Err(error) = deaf.write_all(b"GET /main.js HTTP/1.1\r\nHost: localhost\r\n\r\n") {
+            break error.kind();
+        }
+    };
+    assert!(matches!(end, ErrorKind::ConnectionReset | ErrorKind::BrokenPipe), "{end}");
+    assert_eq!(status(&server.get("/api/state")), 200);
+}
+
+#[test]
+fn who_does_not_finish_a_request_is_disconnected() {
+    let server = Server::start();
+    // Returns only when the server hangs up, before the reader's patience ends.
+    let mut slow = server.connect();
+    slow.write_all(b"GET / HTTP/1.1\r\nHost: loc").expect("open");
+    let mut answer = Vec::new();
+    slow.read_to_end(&mut answer).expect("ended by the server");
+    assert!(answer.is_empty() || status(&String::from_utf8_lossy(&answer)) == 408);
+}
+
+#[test]
+fn a_live_picture_comes_when_it_is_put_up_and_only_then() {
+    let server = Server::start();
+    assert_eq!(status(&server.get("/api/live/belt")), 204, "nobody makes pictures");
+    let board = Arc::clone(&server.board);
+    std::thread::scope(|scope| {
+        let request = scope.spawn(|| server.get("/api/live/belt?after=6"));
+        let start = Instant::now();
+        while !board.is_wanted(View::Belt) {
+            assert!(start.elapsed() < PATIENCE, "the request does not ask");
+            std::thread::yield_now();
+        }
+        assert!(!board.is_wanted(View::Raw));
+        board.picture(View::Belt, 7, b"{\"frame\":7}\nJPEG".to_vec());
+        let answer = request.join().expect("answered");
+        assert!(answer.ends_with("{\"frame\":7}\nJPEG"), "{answer}");
+    });
+    assert!(!board.is_wanted(View::Belt), "nobody looks any more");
+}
+
+fn parcel(seq: u32) -> Parcel {
+    let record = ParcelRecord {
+        seq,
+        frame: 137,
+        t_s: 3.425,
+        length_mm: 235.1,
+        width_mm: 124.8,
+        height_mm: 70.2,
+        yaw_deg: -12.4,
+        x_mm: 61.0,
+        y_mm: -40.3,
+        sigma_length_mm: 0.3,
+        sigma_width_mm: 0.2,
+        sigma_height_mm: 0.5,
+        belt_speed_mm_per_s: 500.3,
+        shape: Shape::Box,
+        flags: Flags::default(),
+        not_measured: None,
+        may_be_used: true,
+        belt_travel_mm: 1712.5,
+        by_encoder: false,
+    };
+    Parcel { n: 0, utc_ms: 1_795_000_000_123, record, picture: None }
+}
+
+#[test]
+fn the_last_parcels_are_a_table_for_a_spreadsheet() {
+    let server = Server::start();
+    for seq in 41..=43 {
+        server.board.parcel(parcel(seq), Vec::new());
+    }
+    let answer = server.get("/api/parcels.csv");
+    assert!(answer.contains("content-type: text/csv; charset=utf-8\r\n"), "{answer}");
+    assert!(answer.contains("content-disposition: attachment; filename=\"parcels.csv\"\r\n"));
+    let (_, table) = answer.split_once("\r\n\r\n").expect("an answer");
+    let lines: Vec<Vec<&str>> = table.lines().map(|line| line.split(',').collect()).collect();
+    assert_eq!(lines.len(), 4, "{table}");
+    let cell = |name: &str| {
+        let column = lines[0].iter().position(|head| *head == name);
+        lines[3][column.unwrap_or_else(|| panic!("no column {name}"))]
+    };
+    for (name, value) in [
+        ("n", "3"),
+        ("utc", "2026-11-18T11:06:40.123Z"),
+        ("seq", "43"),
+        ("length_mm", "235.1"),
+        ("yaw_deg", "-12.4"),
+        ("shape", "box"),
+        ("flags", ""),
+        ("not_measured", ""),
+        ("may_be_used", "true"),
+        ("version", "1.2.3"),
+    ] {
+        assert_eq!(cell(name), value, "{name}");
+    }
+}
+
+#[test]
+fn strange_words_stay_words() {
+    let server = Server::start();
+    let detail = "</script><script>alert(1)</script>\u{0}\"'";
+    let event = Event { n: 0, utc_ms: 1, kind: "began", code: 2, detail: detail.into() };
+    server.board.event(event);
+    let answer = server.get("/api/events");
+    assert!(answer.contains("content-type: application/json"), "never taken for a page");
+    assert_eq!(body(&answer)["items"][0]["detail"], detail);
+}
+
+fn page(name: &str) -> String {
+    let path = Path::new(env!("CARGO_MANIFEST_DIR")).join("src/web/page").join(name);
+    std::fs::read_to_string(path).expect("committed")
+}
+
+const SCRIPTS: [&str; 7] =
+    ["main.js", "common.js", "live.js", "overview.js", "parcels.js", "plc.js", "events.js"];
+
+#[test]
+fn the_page_makes_no_markup_from_words_and_fetches_nothing_from_elsewhere() {
+    for name in SCRIPTS {
+        let text = page(name);
+        for word in
+            ["innerHTML", "outerHTML", "insertAdjacentHTML", "document.write", "eval(", "Function("]
+        {
+            assert!(!text.contains(word), "{name} has {word}");
+        }
+        let elsewhere = text.replace("http://www.w3.org/2000/svg", "");
+        assert!(!elsewhere.contains("http:") && !elsewhere.contains("https:"), "{name}");
+    }
+    let html = page("index.html");
+    for word in ["http:", "https:", "style=", "<style", "onclick", "javascript:", "<script>"] {
+        assert!(!html.contains(word), "index.html has {word}");
+    }
+}
+
+#[test]
+fn every_word_is_there_in_both_languages() {
+    let texts = |name: &str| -> BTreeMap<String, String> {
+        serde_json::from_str(&page(name)).expect("texts")
+    };
+    let (english, german) = (texts("en.json"), texts("de.json"));
+    assert!(english.keys().eq(german.keys()), "the same keys");
+    let mut needed: BTreeSet<String> = BTreeSet::new();
+    needed.extend(Flags::ALL.iter().map(|(_, name, _)| format!("flag.{name}")));
+    needed.extend(NotMeasured::ALL.iter().map(|(_, name, _)| format!("not_measured.{name}")));
+    needed.extend(COMMANDS.iter().map(|(code, _)| format!("command.{code}")));
+    for (code, _) in REASONS {
+        needed.extend([format!("reason.{code}"), format!("remedy.{code}")]);
+    }
+    for kind in ["started", "stopped", "began", "ended", "camera_lost", "command", "import"] {
+        needed.insert(format!("event.{kind}"));
+    }
+    for name in SCRIPTS {
+        let script = page(name);
+        for (at, _) in script.match_indices("t(\"") {
+            // Not the end of another function's name.
+            if !script[..at].ends_with(|c: char| c.is_alphanumeric()) {
+                needed.extend(script[at + 3..].split('"').next().map(str::to_owned));
+            }
+        }
+    }
+    assert!(needed.len() > 100, "only {} were found", needed.len());
+    for key in &needed {
+        assert!(english.contains_key(key), "{key} has no text");
+    }
+    // What is replaced in one language is replaced in the other.
+    let places = |text: &str| -> BTreeSet<String> {
+        text.split('{').skip(1).filter_map(|t| t.split('}').next()).map(str::to_owned).collect()
+    };
+    for (key, text) in &english {
+        assert_eq!(places(text), places(&german[key]), "{key}");
+        assert!(!text.is_empty() && !german[key].is_empty(), "{key}");
+    }
+}
