@@ -304,7 +304,7 @@ fn add_row(
         .zip(sums)
         .map(|(from, (to, views))| ((from, to), views))
     {
-        let counts = i16::from(usable & (grey > 0));
+        let counts = i16::from(usable && grey > 0);
         let [x, y] = step.map(|step| counts * i16::from(step));
         step_sum[0] += x;
         step_sum[1] += y;

@@ -121,11 +121,9 @@ impl Steps {
             for i in 0..width {
                 let (mut sum, mut unseen) = (0u32, false);
                 for v in j * side..(j + 1) * side {
-                    let row = grey.row(v);
-                    for u in i * side..(i + 1) * side {
-                        sum += u32::from(row[u]);
-                        unseen |= !bits::get(&seen[v * n..][..n], u);
-                    }
+                    let here = i * side..(i + 1) * side;
+                    sum += grey.row(v)[here.clone()].iter().map(|&g| u32::from(g)).sum::<u32>();
+                    unseen |= here.into_iter().any(|u| !bits::get(&seen[v * n..][..n], u));
                 }
                 let at = j * width + i;
                 let mean = sum as f32 / (side * side) as f32;
