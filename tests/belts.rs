@@ -119,12 +119,12 @@ fn a_plain_belt_frozen_by_compression_does_not_stand() {
     assert_honest(&records, 3);
 }
 
-/// Draws ribs across the belt, `period_mm` apart, that ride on it.
-fn ribs(frame: &mut [u8], grey: f64, period_mm: f64, travel_mm: f64) {
+/// Draws ribs across the belt that ride on it: their height in grey levels, `period_mm` apart.
+fn ribs(frame: &mut [u8], grey: f64, [rib_grey, period_mm]: [f64; 2], travel_mm: f64) {
     for row in frame.chunks_exact_mut(640) {
         for (u, pixel) in row.iter_mut().enumerate() {
             let x_mm = (u as f64 - 319.5) * 1000.0 / 512.0 - travel_mm;
-            let rib = 5.0 * (std::f64::consts::TAU * x_mm / period_mm).sin();
+            let rib = rib_grey * (std::f64::consts::TAU * x_mm / period_mm).sin();
             if (f64::from(*pixel) - grey).abs() < 9.0 {
                 *pixel = (f64::from(*pixel) + rib) as u8;
             }
@@ -139,11 +139,49 @@ fn a_belt_with_ribs_is_never_silently_wrong_running_or_stopped() {
         let mut scenario = boxes(2, 60.0, 0.0, stop);
         scenario.frames += 40;
         let (records, pipeline) = run(&scenario, site(&scenario, 500.0), |_, frame, time| {
-            ribs(frame, 60.0, period_mm, scenario.travel_at_frame_mm(time.index));
+            ribs(frame, 60.0, [5.0, period_mm], scenario.travel_at_frame_mm(time.index));
         });
         assert_honest(&records, 2);
         let known = pipeline.health().texture == Knowledge::Measured;
         assert_eq!(known, period_mm > 40.0, "{period_mm} mm: {:?}", pipeline.health());
+    }
+}
+
+/// Noise of 5 grey levels a pixel, four times the texture.
+const NOISY: &str = "[noise]\nread_grey = 5.0\n";
+
+#[test]
+fn a_texture_fainter_than_the_camera_s_noise_gives_the_speed() {
+    let mut scenario = boxes(0, 60.0, 1.3, NOISY);
+    scenario.frames = 200;
+    let (mut measured, mut locked) = (0, None);
+    let (mut shown_mm, mut true_mm) = (0.0, 0.0);
+    run(&scenario, site(&scenario, 490.0), |pipeline, _, time| {
+        // What is known before a frame is the last one's.
+        let at_mm = scenario.travel_at_frame_mm(time.index.saturating_sub(1));
+        let travel_mm = pipeline.belt_position().travel_mm;
+        measured += u32::from(pipeline.belt_motion().1);
+        if pipeline.belt_motion().1 {
+            let (from_mm, from_true_mm) = *locked.get_or_insert((travel_mm, at_mm));
+            (shown_mm, true_mm) = (travel_mm - from_mm, at_mm - from_true_mm);
+        }
+    });
+    eprintln!("{measured} frames measured, {shown_mm:.1} for {true_mm:.1} mm");
+    // Single frames are good to 0.2 px of 2 mm, and do not add up.
+    assert!(measured > 100 && (shown_mm / true_mm - 1.0).abs() < 5e-4, "{shown_mm} {true_mm}");
+}
+
+#[test]
+fn faint_ribs_under_a_noisy_camera_are_no_measure_of_the_speed() {
+    for period_mm in [7.0, 18.5, 30.0] {
+        let scenario = boxes(1, 60.0, 0.0, NOISY);
+        let mut measured = 0;
+        let (records, _) = run(&scenario, site(&scenario, 490.0), |pipeline, frame, time| {
+            measured += u32::from(pipeline.belt_motion().1);
+            ribs(frame, 60.0, [2.0, period_mm], scenario.travel_at_frame_mm(time.index));
+        });
+        assert_eq!(measured, 0, "{period_mm} mm");
+        assert_honest(&records, 1);
     }
 }
 

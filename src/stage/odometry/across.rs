@@ -1,6 +1,6 @@
 //! The belt's travel over a gap in the frames, by its texture before and after.
 
-use super::{Knowledge, Match, Odometry, PAIRS_MIN, RIDE_MARGIN, SCOUT_SIGMA, STANDSTILL_GREY_MIN};
+use super::{Knowledge, MATCH_MIN, Odometry, PAIRS_MIN, RIDE_MARGIN, STANDSTILL_GREY_MIN, chance};
 use crate::stage::background::Background;
 
 /// Over a gap so much is looked at, once and on all rows: a parcel is still in view.
@@ -43,9 +43,9 @@ impl Odometry {
         let back = BACK_SHARE * columns;
         let forward = self.speed_mm_per_s >= 0.0;
         let (from, to) = if forward { (-back, most) } else { (-most, back) };
-        let chance = |m: &Match| SCOUT_SIGMA / f64::from(m.pairs).sqrt();
         let found = self.best(from, to).filter(|m| {
-            m.rho > chance(m) && (m.shift_px.abs() > 2.0 || m.texture_grey >= STANDSTILL_GREY_MIN)
+            m.rho > chance(m.pairs).max(MATCH_MIN)
+                && (m.shift_px.abs() > 2.0 || m.texture_grey >= STANDSTILL_GREY_MIN)
         });
         let half = self.shift_max_px();
         let peaks = self.peaks(-half, half, None);
@@ -53,7 +53,9 @@ impl Odometry {
         let Some(found) = found else {
             let [here, ..] = self.correlations(0);
             self.take_key();
-            let would_show = follows && was_known && here.pairs >= 2 * PAIRS_MIN;
+            // A faint texture may well not show what a gap's one look needs.
+            let was_clear = was_known && !self.faint;
+            let would_show = follows && was_clear && here.pairs >= 2 * PAIRS_MIN;
             return if would_show {
                 Across::Beyond(most * self.mm_per_px)
             } else {

@@ -6,7 +6,7 @@
 //! not add up frame by frame; a new key is taken when the overlap gets small. In the belt
 //! view all belt motion is horizontal, so a match is one number.
 //! While it is not locked, a few of the rows are searched over every speed in both directions, and
-//! several frames must agree; but a whole multiple of the last step is one at once: frames are missing
+//! several frames must agree; a texture fainter than the camera's noise is searched on all rows; but a whole multiple of the last step is one at once: frames are missing
 //! whose time stamps do not tell. A texture that fits itself at several plausible shifts is ambiguous,
 //! and silhouettes that move otherwise refute what the texture shows: neither is a measurement.
 //! Cost: at most 250,000 pixels taken out, and as many products for each shift tried, 13 when locked;
@@ -15,11 +15,13 @@
 //! through three shifts is off by 0.05 px, always towards the same side at the same speed.
 
 mod across;
+mod correlation;
 mod peaks;
 
 pub use across::Across;
 
-use peaks::{PEAK_HALF, PEAK_SHIFTS, Peaks, peak};
+use correlation::{Correlation, MATCH_MIN, Match, chance, match_min};
+use peaks::{LIKE_HEIGHT, PEAK_HALF, PEAK_SHIFTS, Peaks, peak};
 
 use crate::camera::BeltView;
 use crate::error::Result;
@@ -39,8 +41,6 @@ const ROW_STEP_MIN: usize = 2;
 const TEXTURE_PX: usize = 250_000;
 /// When locked, shifts this far around the prediction are tried.
 const LOCKED_SEARCH_PX: f64 = 1.5;
-/// A correlation above this is a match: 200 x 800 px of pure noise stay below 0.02.
-const MATCH_MIN: f64 = 0.08;
 /// Pairs of textured pixels below which a match proves nothing.
 const PAIRS_MIN: u32 = 4000;
 /// A new key when the belt has moved on by this share of the zone.
@@ -50,9 +50,6 @@ const KEY_TRAVEL: f64 = 0.45;
 const SCOUT_PX: usize = 12_000;
 /// Shifts up to this share of the zone leave enough overlap.
 const SHIFT_SHARE: f64 = 0.5;
-/// On these few rows a correlation is no accident from this many standard deviations of chance on;
-/// neighbouring pixels of a texture are alike, which makes chance twice as wide.
-const SCOUT_SIGMA: f64 = 12.0;
 /// A speed far from the nominal one is believed when this many frames on end show it ...
 const SCOUT_FRAMES: u32 = 3;
 /// ... within this share.
@@ -140,6 +137,8 @@ pub struct Odometry {
     seen: Option<(f64, u32)>,
     knowledge: Knowledge,
     locked: bool,
+    /// The last match was fainter than [`MATCH_MIN`].
+    faint: bool,
     /// Frames without a match since the last one.
     misses: u32,
     /// Frames that were missing though the time stamps did not tell.
@@ -148,24 +147,6 @@ pub struct Odometry {
     proofs: u32,
     /// Times since then that what lies on the belt moved otherwise, and whether it does now.
     doubts: (u32, bool),
-}
-
-struct Match {
-    shift_px: f64,
-    rho: f64,
-    pairs: u32,
-    /// Root of the texture's covariance, grey levels.
-    texture_grey: f64,
-    /// Frames missing before this one, by its step: its time is as much more than its stamp.
-    missing: u32,
-}
-
-/// Sums over both textures at one shift.
-#[derive(Clone, Copy, Default)]
-struct Correlation {
-    rho: f64,
-    pairs: u32,
-    covariance: f64,
 }
 
 impl Odometry {
@@ -231,6 +212,7 @@ impl Odometry {
             seen: None,
             knowledge: Knowledge::default(),
             locked: false,
+            faint: false,
             misses: 0,
             untold_gaps: 0,
             proofs: 0,
@@ -271,6 +253,7 @@ impl Odometry {
                 self.speed_mm_per_s += SPEED_FOLLOW * (step_mm / dt_s - self.speed_mm_per_s);
             }
             self.knowledge = Knowledge::Measured;
+            self.faint = m.rho < MATCH_MIN;
             self.misses = 0;
             self.shift_px = Some(m.shift_px);
             let far = m.shift_px.abs() > KEY_TRAVEL * self.columns.len() as f64;
@@ -432,17 +415,28 @@ impl Odometry {
         let predicted = last_px + px(self.speed_mm_per_s);
         if self.locked && self.speed_mm_per_s.abs() > SLOW * self.expected.nominal_mm_per_s {
             let near = self.best(predicted - LOCKED_SEARCH_PX, predicted + LOCKED_SEARCH_PX);
-            if near.is_some() {
+            // A faint one may be one of several, every time.
+            if near.as_ref().is_some_and(|m| m.rho >= MATCH_MIN) {
                 return near;
             }
         }
         let fastest =
             px(self.expected.nominal_mm_per_s) * (1.0 + self.expected.speed_error_max) + 2.0;
-        let found = self.best(last_px + slow, last_px + fastest).or_else(|| {
+        let moving = self.best(last_px + slow, last_px + fastest);
+        let is_clear = |m: &Match| m.rho >= MATCH_MIN;
+        let found = if moving.as_ref().is_some_and(is_clear) {
+            moving
+        } else {
             let still = self.best(last_px - 2.0, last_px + slow + 1.0);
-            still.filter(|m| m.texture_grey >= STANDSTILL_GREY_MIN)
+            still.filter(|m| is_clear(m) && m.texture_grey >= STANDSTILL_GREY_MIN).or(moving)
+        };
+        let (from, to) = (last_px - fastest, last_px + fastest);
+        // A few rows are too few to show its rivals.
+        let every = self.scout_every() as u32;
+        let is_faint = found.as_ref().is_some_and(|m| {
+            f64::from(LIKE_HEIGHT) * m.rho < chance(m.pairs / every).max(MATCH_MIN)
         });
-        let peaks = self.peaks(last_px - fastest, last_px + fastest, None);
+        let peaks = if is_faint { self.faint_peaks(from, to) } else { self.peaks(from, to, None) };
         match (found, peaks) {
             (Some(found), peaks) if !peaks.rival_of(found.shift_px) => Some(found),
             (Some(_), _) => {
@@ -506,12 +500,17 @@ impl Odometry {
         Some(found)
     }
 
+    /// Of so many rows one is searched over every speed.
+    fn scout_every(&self) -> usize {
+        (self.key.len() / SCOUT_PX).max(1)
+    }
+
     /// Peaks of the correlation on a few rows, over a range of shifts, but for those near `without`.
     fn peaks(&mut self, from: f64, to: f64, without: Option<isize>) -> Peaks {
         let most = self.shift_max_px();
         let (from, to) = (from.max(-most).floor() as isize, to.min(most).ceil() as isize);
         let n = Self::blocks(&self.columns).len();
-        let every = (self.key.len() / SCOUT_PX).max(1);
+        let every = self.scout_every();
         let rows = self.key.chunks_exact(n).zip(self.current.chunks_exact(n));
         for (shift, out) in (from..=to).zip(&mut *self.scout) {
             let mut sums = Sums::default();
@@ -519,11 +518,25 @@ impl Odometry {
                 correlate(self.level, key, current, shift, &mut sums);
             }
             let c = Correlation::of(&sums);
-            let chance = SCOUT_SIGMA / f64::from(c.pairs.max(1)).sqrt();
-            *out = if c.rho > chance.max(MATCH_MIN) { c.rho as f32 } else { 0.0 };
+            *out = if c.rho > chance(c.pairs).max(MATCH_MIN) { c.rho as f32 } else { 0.0 };
         }
         let count = ((to - from + 1).max(0) as usize).min(self.scout.len());
         Peaks::of(&self.scout[..count], from, without)
+    }
+
+    /// The same on all rows, down to half of what a match needs.
+    fn faint_peaks(&mut self, from: f64, to: f64) -> Peaks {
+        let most = self.shift_max_px();
+        let (from, to) = (from.max(-most).floor() as isize, to.min(most).ceil() as isize);
+        let count = ((to - from + 1).max(0) as usize).min(self.scout.len());
+        for first in (0..count).step_by(PEAK_SHIFTS) {
+            let correlations = self.correlations(from + first as isize);
+            for (out, c) in self.scout[first..count].iter_mut().zip(correlations) {
+                let shows = c.pairs >= PAIRS_MIN && c.rho > 0.5 * match_min(c.pairs);
+                *out = if shows { c.rho as f32 } else { 0.0 };
+            }
+        }
+        Peaks::of(&self.scout[..count], from, None)
     }
 
     /// The best interior shift of a range, to a hundredth of a pixel.
@@ -546,7 +559,7 @@ impl Odometry {
         }
         let (shift, c) = best?;
         // A maximum at the end of the range is a slope, not a match.
-        if c.rho < MATCH_MIN || shift == from || shift == to {
+        if c.rho < match_min(c.pairs) || shift == from || shift == to {
             return None;
         }
         if shift - PEAK_HALF != known.0 {
@@ -576,16 +589,5 @@ impl Odometry {
             let sums = jobs.iter().fold(Sums::default(), |all, (_, more)| all.plus(&more[k]));
             Correlation::of(&sums)
         })
-    }
-}
-
-impl Correlation {
-    fn of(sums: &Sums) -> Self {
-        let norm = (sums.aa as f64 * sums.bb as f64).sqrt();
-        Self {
-            rho: if norm > 0.0 { sums.ab as f64 / norm } else { 0.0 },
-            pairs: sums.n,
-            covariance: sums.ab as f64 / f64::from(sums.n.max(1)),
-        }
     }
 }

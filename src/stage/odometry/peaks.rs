@@ -5,7 +5,7 @@ pub const PEAK_HALF: isize = 4;
 /// Shifts that the interpolation needs.
 pub const PEAK_SHIFTS: usize = 2 * PEAK_HALF as usize + 1;
 /// Another peak of at least this share of the best makes it ambiguous.
-const LIKE_HEIGHT: f32 = 0.7;
+pub const LIKE_HEIGHT: f32 = 0.7;
 /// Peaks nearer than this are one, px.
 const PEAK_APART_PX: isize = 3;
 
