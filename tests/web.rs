@@ -10,6 +10,7 @@ use std::io::{ErrorKind, Read, Write};
 use std::net::{SocketAddr, TcpStream};
 use std::path::Path;
 use std::sync::Arc;
+use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::{Duration, Instant};
 
 /// Nothing a test waits for takes longer.
@@ -40,15 +41,40 @@ struct Server {
     thread: Option<std::thread::JoinHandle<()>>,
 }
 
+/// A machine whose disk does not answer, until it is let.
+struct Hung(Arc<AtomicBool>);
+
+impl Machine for Hung {
+    fn state(&self) -> State {
+        Still.state()
+    }
+    fn plc(&self) -> Plc {
+        Still.plc()
+    }
+    fn archived(&self, before: Option<u64>, limit: usize) -> Result<Archived, String> {
+        while !self.0.load(Ordering::Relaxed) {
+            std::thread::sleep(Duration::from_millis(1));
+        }
+        Still.archived(before, limit)
+    }
+    fn archived_picture(&self, entry: u64) -> Option<Vec<u8>> {
+        Still.archived_picture(entry)
+    }
+}
+
 impl Server {
     fn start() -> Self {
+        Self::of(Arc::new(Still))
+    }
+
+    fn of(machine: Arc<dyn Machine>) -> Self {
         let settings = Web { address: [127, 0, 0, 1].into(), port: 0, ..Web::default() };
         let listening = web::listen(&settings);
         let address = listening.as_ref().expect("bound").local_addr().expect("bound");
         let board = Arc::new(Board::new(5));
         let served = Arc::clone(&board);
         let thread = std::thread::spawn(move || {
-            web::serve(&settings, listening, &served, Arc::new(Still)).expect("serves");
+            web::serve(&settings, listening, &served, machine).expect("serves");
         });
         Self { address, board, thread: Some(thread) }
     }
@@ -426,5 +452,30 @@ fn every_word_is_there_in_both_languages() {
     for (key, text) in &english {
         assert_eq!(places(text), places(&german[key]), "{key}");
         assert!(!text.is_empty() && !german[key].is_empty(), "{key}");
+    }
+}
+
+#[test]
+fn questions_left_behind_at_a_disk_that_hangs_are_bounded_and_the_rest_is_served() {
+    let answers = Arc::new(AtomicBool::new(false));
+    let server = Server::of(Arc::new(Hung(Arc::clone(&answers))));
+    let ask = "GET /api/archive HTTP/1.1\r\nHost: localhost\r\n\r\n";
+    let start = Instant::now();
+    // Each asks and goes away; more than there are places for.
+    let refused = loop {
+        let mut stream = server.connect();
+        stream.set_read_timeout(Some(Duration::from_millis(50))).expect("a time");
+        stream.write_all(ask.as_bytes()).expect("taken");
+        let mut head = [0; 12];
+        if stream.read_exact(&mut head).is_ok() {
+            break String::from_utf8_lossy(&head).into_owned();
+        }
+        assert!(start.elapsed() < PATIENCE, "every question is kept");
+    };
+    assert_eq!(refused, "HTTP/1.1 503");
+    assert!(server.get("/api/state").starts_with("HTTP/1.1 200"));
+    answers.store(true, Ordering::Relaxed);
+    while !server.get("/api/archive").starts_with("HTTP/1.1 200") {
+        assert!(start.elapsed() < 2 * PATIENCE, "the places are not given back");
     }
 }

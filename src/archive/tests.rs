@@ -5,6 +5,7 @@ use super::writer::Space;
 use super::*;
 use std::fs;
 use std::path::{Path, PathBuf};
+use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::{Duration, Instant};
 
 const PATIENCE: Duration = Duration::from_secs(10);
@@ -175,6 +176,30 @@ fn more_entries_than_the_ring_holds_are_counted_and_nobody_waits() {
     // One may be in the writer's hands.
     assert!(condition.written == 0 && (935..=936).contains(&condition.lost), "{condition:?}");
     archive.finish(Duration::from_millis(1));
+}
+
+static DISK_ANSWERS: AtomicBool = AtomicBool::new(false);
+
+fn disk_that_hangs(folder: &Path) -> std::io::Result<Space> {
+    while !DISK_ANSWERS.load(Ordering::Relaxed) {
+        std::thread::sleep(Duration::from_millis(1));
+    }
+    small_disk(folder)
+}
+
+#[test]
+fn what_a_hanging_disk_cost_is_told_in_the_chain_too() {
+    let folder = folder("hangs");
+    let archive = Archive::start_on(&folder, 64 * MIB, disk_that_hangs).expect("starts");
+    (1..=1000).for_each(|i| archive.put(entry(i, 10)));
+    let lost = archive.condition().lost;
+    assert!(lost > 900, "{lost}");
+    DISK_ANSWERS.store(true, Ordering::Relaxed);
+    archive.finish(PATIENCE);
+    let verdict = Reader::open(&folder).expect("there").verify().expect("readable");
+    assert_eq!(verdict.told_lost, lost, "{verdict:?}");
+    // Twice told: what was lost before the first was written, and the rest.
+    assert!((1..=2).contains(&(verdict.entries + lost - 1000)), "{verdict:?}");
 }
 
 #[test]

@@ -98,7 +98,8 @@ impl Archive {
             shared: Arc::clone(&shared),
             open: None,
             retry_at: None,
-            unwritten: 0,
+            told: 0,
+            newest_ms: 0,
         };
         std::thread::Builder::new()
             .name("archive".into())
@@ -147,8 +148,10 @@ struct Writer {
     shared: Arc<Shared>,
     open: Option<Open>,
     retry_at: Option<Instant>,
-    /// Entries that the disk did not take and that the chain does not tell of yet.
-    unwritten: u64,
+    /// Of the entries lost, those that the chain tells of.
+    told: u64,
+    /// Time of the newest entry that came.
+    newest_ms: u64,
 }
 
 /// The archive while the disk obeys.
@@ -181,12 +184,23 @@ impl Writer {
             // Also when entries come without a pause.
             self.sync(SYNC_PERIOD);
         }
+        self.tell_lost();
         self.sync(Duration::ZERO);
     }
 
+    /// At the end: what was lost since the last entry.
+    fn tell_lost(&mut self) {
+        if self.retry_at.is_none()
+            && let Err(e) = self.write_gap()
+        {
+            self.fail(&e);
+        }
+    }
+
     fn take(&mut self, entry: &Entry) {
+        self.newest_ms = entry.utc_ms;
         if self.retry_at.is_some_and(|at| Instant::now() < at) {
-            return self.lose(1);
+            return self.lose();
         }
         match self.write(entry) {
             Ok(()) => {
@@ -194,8 +208,9 @@ impl Writer {
                 self.heal();
             }
             Err(e) => {
-                self.lose(1);
+                // Who sees the count sees the reason.
                 self.fail(&e);
+                self.lose();
             }
         }
     }
@@ -210,9 +225,8 @@ impl Writer {
         }
     }
 
-    fn lose(&mut self, count: u64) {
-        self.unwritten += count;
-        self.shared.lost.fetch_add(count, Ordering::Relaxed);
+    fn lose(&self) {
+        self.shared.lost.fetch_add(1, Ordering::Relaxed);
     }
 
     fn fail(&mut self, error: &io::Error) {
@@ -248,21 +262,30 @@ impl Writer {
         if entry.text.len().max(entry.picture.len()) > PART_BYTES_MAX {
             return Err(io::Error::new(ErrorKind::InvalidInput, "an entry is too large"));
         }
-        let (limits, unwritten) = ((self.bytes_max, self.space), self.unwritten);
+        self.write_gap()?;
+        self.append(entry)
+    }
+
+    /// Tell in the chain what was lost, on the way to the disk and before it, and not told yet.
+    fn write_gap(&mut self) -> io::Result<()> {
+        let lost = self.shared.lost.load(Ordering::Relaxed);
+        let untold = lost - self.told;
+        if untold == 0 {
+            return Ok(());
+        }
+        let text = format!("{{\"lost\":{untold}}}");
+        let (kind, utc_ms) = (Kind::Gap, self.newest_ms);
+        self.append(&Entry { kind, utc_ms, text, picture: Vec::new() })?;
+        self.told = lost;
+        Ok(())
+    }
+
+    fn append(&mut self, entry: &Entry) -> io::Result<()> {
+        let limits = (self.bytes_max, self.space);
         let folder = self.folder.clone();
         let open = self.opened()?;
-        if unwritten > 0 {
-            let gap = Entry {
-                kind: Kind::Gap,
-                utc_ms: entry.utc_ms,
-                text: format!("{{\"lost\":{unwritten}}}"),
-                picture: Vec::new(),
-            };
-            open.append(&folder, limits, &gap)?;
-        }
         open.append(&folder, limits, entry)?;
         let bytes = open.bytes();
-        self.unwritten = 0;
         self.shared.bytes.store(bytes, Ordering::Relaxed);
         Ok(())
     }
@@ -313,6 +336,8 @@ impl Open {
         let used = self.segments.last().map_or(0, |(_, bytes)| *bytes);
         if self.file.is_none() || used + bytes.len() as u64 > segment_max.max(HEAD_BYTES as u64 * 2)
         {
+            // A full disk has no room for the head either.
+            self.make_room(folder, (bytes_max, space), (bytes.len() + HEAD_BYTES) as u64)?;
             self.begin(folder)?;
         }
         self.make_room(folder, (bytes_max, space), bytes.len() as u64)?;

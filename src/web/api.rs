@@ -15,6 +15,7 @@ use axum::{Json, Router};
 use serde::Serialize;
 use std::sync::Arc;
 use std::time::Duration;
+use tokio::sync::Semaphore;
 
 /// A request for a live picture waits this long for one.
 const PICTURE_PATIENCE: Duration = Duration::from_secs(1);
@@ -28,10 +29,17 @@ const DIGITS_MAX: usize = 20;
 struct Sources {
     board: Arc<Board>,
     machine: Arc<dyn Machine>,
+    questions: Arc<Semaphore>,
 }
 
-/// All that is served.
-pub(super) fn router(board: Arc<Board>, machine: Arc<dyn Machine>, hosts: Hosts) -> Router {
+/// All that is served; so many questions at most may wait for the disk.
+pub(super) fn router(
+    board: Arc<Board>,
+    machine: Arc<dyn Machine>,
+    hosts: Hosts,
+    questions_max: usize,
+) -> Router {
+    let questions = Arc::new(Semaphore::new(questions_max));
     let mut router = Router::new();
     for (path, kind, bytes) in ASSETS {
         let asset = move || async move { ([(header::CONTENT_TYPE, *kind)], *bytes) };
@@ -50,7 +58,7 @@ pub(super) fn router(board: Arc<Board>, machine: Arc<dyn Machine>, hosts: Hosts)
         .route("/metrics", get(metrics))
         .fallback(|| async { refusal(StatusCode::NOT_FOUND, "there is no such page") })
         .layer(middleware::from_fn_with_state(hosts, admit))
-        .with_state(Sources { board, machine })
+        .with_state(Sources { board, machine, questions })
 }
 
 /// An answer that says what was wrong.
@@ -205,9 +213,16 @@ async fn read<T: Send + 'static>(
     from: &Sources,
     read: impl FnOnce(&dyn Machine) -> T + Send + 'static,
 ) -> Result<T, Response> {
+    // Who asks and goes away leaves his question behind: so many may wait for the disk, and no more.
+    let busy = |_| refusal(StatusCode::SERVICE_UNAVAILABLE, "the archive is being read by others");
+    let place = Arc::clone(&from.questions).try_acquire_owned().map_err(busy)?;
     let machine = Arc::clone(&from.machine);
     let failed = |_| refusal(StatusCode::INTERNAL_SERVER_ERROR, "the archive was not read");
-    tokio::task::spawn_blocking(move || read(&*machine)).await.map_err(failed)
+    let answer = move || {
+        let _place = place;
+        read(&*machine)
+    };
+    tokio::task::spawn_blocking(answer).await.map_err(failed)
 }
 
 async fn archive(

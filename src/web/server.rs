@@ -108,7 +108,9 @@ async fn accept(
 ) {
     let listener = patiently(settings, listening).await;
     let door = Doorkeeper::new(settings.connections_max);
-    let router = api::router(Arc::clone(board), machine, Hosts::new(settings));
+    // A visitor asks one question at a time.
+    let questions_max = settings.connections_max;
+    let router = api::router(Arc::clone(board), machine, Hosts::new(settings), questions_max);
     loop {
         match listener.accept().await {
             Ok((stream, address)) => {

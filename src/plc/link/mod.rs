@@ -55,7 +55,7 @@ pub struct Link {
     /// Parcels that found `to_send` full.
     unsent: u64,
     /// Published, and not yet told to those who watch.
-    published: Deque<ParcelRecord, QUEUE_PARCELS>,
+    published: Deque<ParcelRecord, WAITING_MAX>,
     /// Who wrote registers last, and when.
     written: Option<(Sender, Instant)>,
     commanded: Option<Commanded>,
