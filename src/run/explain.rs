@@ -31,6 +31,7 @@ pub struct Explainer {
     evidence: Evidence,
     parcels: Parcels,
     looked: i64,
+    breaks: u32,
     /// As JSON: each record, and what it was decided from.
     records: Vec<serde_json::Value>,
     /// Heights of the columns decided, and the first one's number.
@@ -57,12 +58,28 @@ impl Explainer {
         let parcels = Parcels::new(view, zone, &evidence, site.height_max_mm, &mut memory)?;
         memory.seal()?;
         let (folder, records, picture) = (folder.to_owned(), Vec::new(), Vec::new());
-        Ok(Self { folder, views, evidence, parcels, looked: 0, records, picture, pictured: 0 })
+        Ok(Self {
+            folder,
+            views,
+            evidence,
+            parcels,
+            // Columns begin anywhere.
+            looked: i64::MIN / 2,
+            breaks: 0,
+            records,
+            picture,
+            pictured: 0,
+        })
     }
 
     /// A frame more, after the pipeline's step.
     pub fn frame(&mut self, pipeline: &Pipeline, time: FrameTime) {
         let at = pipeline.belt_position();
+        if at.breaks != self.breaks {
+            // What was before has no place in what comes.
+            self.look(pipeline, f64::NEG_INFINITY);
+            self.breaks = at.breaks;
+        }
         if self.views.offer(pipeline.pixels(), at, time)
             && let Some(place) = self.views.newest()
         {
@@ -70,7 +87,8 @@ impl Explainer {
             self.parcels.add(&self.views, place, pipeline.seen());
         }
         self.evidence.advance(&self.views, at.travel_mm, at.breaks);
-        if self.evidence.decided().end - self.looked >= LOOK_COLUMNS {
+        let decided = self.evidence.decided();
+        if !decided.is_empty() && decided.end - self.looked >= LOOK_COLUMNS {
             self.look(pipeline, pipeline.site().config.zone.x_max_mm - at.travel_mm);
         }
     }

@@ -22,6 +22,8 @@ pub const VIEWS_MAX: usize = VIEWS_PER_ZONE * ZONES;
 /// Measured travel after which what was only assumed before is set right, share of the zone: 0.05 % of
 /// the speed, by steps that are good to 0.05 mm.
 const REVISE_SHARE: f64 = 0.1;
+/// The belt's speed over the one assumed, so that it is believed to have run so before.
+const RATIO_REVISED: std::ops::RangeInclusive<f64> = 0.8..=1.25;
 /// A stretch between two views was measured when this share of it was.
 const MEASURED_SHARE: f64 = 0.5;
 
@@ -111,6 +113,13 @@ impl Views {
             return;
         }
         let speed_mm_per_s = travel_mm / (newest.time.t_s - first.time.t_s);
+        let Some(oldest) = self.places().last().map(|place| self.kept[place]) else { return };
+        let assumed_mm = first.at.travel_mm - oldest.at.travel_mm;
+        let ratio = speed_mm_per_s * (first.time.t_s - oldest.time.t_s) / assumed_mm;
+        // Beyond that, or without times, it did not run as it does now.
+        if !RATIO_REVISED.contains(&ratio) {
+            return;
+        }
         let measured = stretches().take_while(is_measured).count();
         for place in self.places().skip(measured + 1) {
             let kept = &mut self.kept[place];

@@ -84,7 +84,7 @@ impl WholePass<'_> {
             params = fitted.params;
             best = Some(fitted);
         }
-        let estimate = best?;
+        let estimate = best.filter(|estimate| estimate.edge_count > 0)?;
         // What lies on the belt itself, its texture or a label stuck to it, is no parcel.
         if estimate.params[HEIGHT] < HEIGHT_MIN_MM {
             return None;

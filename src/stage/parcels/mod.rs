@@ -18,7 +18,7 @@ use crate::error::Result;
 use crate::plan::{Memory, Plan};
 use crate::units::BeltRect;
 use rectangle::{GRID_MM, RectangleSearch};
-use stack::{Stack, Window};
+use stack::{Stack, WINDOW_MAX_MM, Window};
 use steps::Steps;
 use still::Still;
 
@@ -352,7 +352,10 @@ impl Parcels {
         let mut best: Option<Rectangle> = None;
         let mut around = [x_mm, y_mm];
         for _ in 0..LOOKS {
-            let window = around.map(|[low, high]| [low - REACH_MM, high + REACH_MM]);
+            let window = around.map(|[low, high]| {
+                let reach_mm = (0.5 * (WINDOW_MAX_MM - (high - low))).clamp(NEAR_MM, REACH_MM);
+                [low - reach_mm, high + reach_mm]
+            });
             self.fill(views, height_mm, window);
             let found = self.search.best(&self.stack, inside_mm.map(|mm| mm as f32));
             let score_mm = best.map_or(0.0, |best| best.score_mm + GRID_MM);

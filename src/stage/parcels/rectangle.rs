@@ -160,7 +160,7 @@ impl RectangleSearch {
         let count = |mm: f64| (mm.min(WINDOW_MAX_MM) / GRID_MM).ceil() as usize;
         let (columns, rows) = (count(WINDOW_MAX_MM), count(zone.y_max_mm - zone.y_min_mm));
         let side = columns + rows + 2 * usize::from(MARGIN);
-        side * side / 2 + 2 * side
+        side * side / 2 + 10 * side + 49
     }
 
     /// Nothing searched.

@@ -156,7 +156,8 @@ impl Stack {
         let count = |length_mm: f64| (length_mm / self.px_mm).ceil().max(1.0) as usize;
         let columns_max = count(WINDOW_MAX_MM).min(self.views.len());
         self.columns = count(window.x_mm[1] - window.x_mm[0]).min(columns_max);
-        self.rows = count(y_max_mm - y_min_mm).min(self.views.len() / self.columns);
+        let rows_max = count(WINDOW_MAX_MM).min(self.views.len() / self.columns);
+        self.rows = count(y_max_mm - y_min_mm).min(rows_max);
         self.origin_mm = [window.x_mm[0], y_max_mm];
         let n = self.columns * self.rows;
         self.steps[..n].fill([0; 2]);

@@ -2,8 +2,8 @@
 //!
 //! In: the grey values of the step pictures. Out: which of their pixels are away from every edge of the still scene.
 //! Such an edge is at the same place in every view, so that along the travel it would look as if it rode
-//! along. The still scene is the running median of each pixel over the views: what passes is soon
-//! forgotten.
+//! along. The still scene is the running median of each pixel over the views, which moves by a grey level a
+//! view: what is in the first one is forgotten after as many views as it has contrast.
 
 use super::steps::{REACH_PX, Steps};
 use crate::camera::BeltView;
@@ -60,8 +60,9 @@ impl Still {
             for u in 0..width {
                 // Only edges along the travel stay where they are on the belt, too.
                 let [above, below] = [v - 1, v + 1].map(|v| f32::from(self.median[v * width + u]));
+                let is_known = above > 0.0 && below > 0.0;
                 let least = STEP_GREY.max(STEP_SHARE * (above + below));
-                if (above - below).abs() > least {
+                if is_known && (above - below).abs() > least {
                     // As far as the slow part spreads it.
                     for v in v.saturating_sub(REACH_PX)..=(v + REACH_PX).min(height - 1) {
                         self.usable[v * width + u] = false;
