@@ -6,11 +6,14 @@
 //! not add up frame by frame; a new key is taken when the overlap gets small. In the belt
 //! view all belt motion is horizontal, so a match is one number.
 //! While it is not locked, a few of the rows are searched over every speed in both directions, and
-//! several frames must agree; a texture fainter than the camera's noise is searched on all rows; but a whole multiple of the last step is one at once: frames are missing
-//! whose time stamps do not tell. A texture that fits itself at several plausible shifts is ambiguous,
-//! and silhouettes that move otherwise refute what the texture shows: neither is a measurement.
-//! Cost: at most 250,000 pixels taken out, and as many products for each shift tried, 13 when locked;
-//! bounded by the zone, whatever the time stamps say.
+//! several frames must agree; but a whole multiple of the last step is one at once: frames are missing
+//! whose time stamps do not tell. A texture fainter than the camera's noise is searched on all rows, in
+//! every frame: a few show neither it nor its rivals. A texture that fits itself at several plausible
+//! shifts is ambiguous, and silhouettes that move otherwise refute what the texture shows: neither is a
+//! measurement.
+//! Cost: at most 250,000 pixels taken out, and as many products for each shift tried: 13 when locked on
+//! a clear texture, every speed in both directions on a faint one; bounded by the zone, whatever the
+//! time stamps say.
 //! Source: normalised cross-correlation; its peak by Lanczos interpolation, because a parabola
 //! through three shifts is off by 0.05 px, always towards the same side at the same speed.
 
