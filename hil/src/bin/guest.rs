@@ -12,18 +12,17 @@ use nix::unistd::Pid;
 use std::fs::File;
 use std::io::{BufRead, BufReader, Read};
 use std::time::{Duration, Instant};
+use v4l::Device;
 use v4l::v4l_sys::{
     v4l2_buf_type_V4L2_BUF_TYPE_VIDEO_OUTPUT, v4l2_buffer, v4l2_field_V4L2_FIELD_NONE, v4l2_format,
     v4l2_memory_V4L2_MEMORY_MMAP, v4l2_requestbuffers,
 };
 use v4l::v4l2::vidioc;
-use v4l::{Device, control};
 
 #[global_allocator]
 static ALLOCATOR: allocations::Counting = allocations::Counting;
 
-const USAGE: &str =
-    "guest feed DEVICE RECORDING FIRST | freeze PID THREAD | formats DEVICE | press DEVICE CONTROL";
+const USAGE: &str = "guest feed DEVICE RECORDING FIRST | freeze PID THREAD | formats DEVICE";
 
 fn main() {
     let arguments: Vec<String> = std::env::args().skip(1).collect();
@@ -34,7 +33,6 @@ fn main() {
         }
         ["freeze", pid, thread] => freeze(pid, thread),
         ["formats", device] => formats(device),
-        ["press", device, name] => press(device, name),
         _ => panic!("{USAGE}"),
     }
 }
@@ -151,15 +149,6 @@ fn freeze(pid: &str, thread: &str) {
         }
     }
     panic!("no thread {thread} in {tasks}");
-}
-
-fn press(device: &str, name: &str) {
-    let device = Device::with_path(device).expect("the device is there");
-    let controls = device.query_controls().expect("it has controls");
-    let found =
-        controls.iter().find(|control| control.name == name).expect("a control of that name");
-    let pressed = control::Control { id: found.id, value: control::Value::Integer(1) };
-    device.set_control(pressed).expect("pressed");
 }
 
 /// A grey ramp in every format that the product knows: all must show the same picture.

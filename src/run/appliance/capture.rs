@@ -1,5 +1,6 @@
 //! The capture thread: frames from the feed into the ring, as long as there are buffers.
 
+use super::attendance::Attendance;
 use super::{FRAME_RING, Frame, Shared};
 use crate::error::Result;
 use crate::plan::Block;
@@ -20,6 +21,7 @@ pub(super) struct Capture<'a> {
     newest: Option<u64>,
     /// Frames that were let go since then, for want of a buffer.
     let_go: u64,
+    attendance: Attendance,
 }
 
 impl<'a> Capture<'a> {
@@ -29,7 +31,8 @@ impl<'a> Capture<'a> {
         ready: Producer<'a, Frame>,
         shared: &'a Shared,
     ) -> Self {
-        Self { feed, free, ready, shared, empty: Deque::new(), newest: None, let_go: 0 }
+        let (empty, attendance) = (Deque::new(), Attendance::default());
+        Self { feed, free, ready, shared, empty, newest: None, let_go: 0, attendance }
     }
 
     pub(super) fn run(mut self) -> Result<()> {
@@ -68,6 +71,9 @@ impl<'a> Capture<'a> {
                     let expected = self.newest.map_or(taken.time.index, |newest| newest + 1);
                     let missing = taken.time.index.saturating_sub(expected);
                     add(&self.shared.frames_lost, missing.saturating_sub(self.let_go));
+                    self.attendance.frame(taken.time.t_s, missing);
+                    let too_many = self.attendance.too_many_missing();
+                    self.shared.frames_missing.store(too_many, Ordering::Relaxed);
                     (self.newest, self.let_go) = (Some(taken.time.index), 0);
                     // There are no more frames than places in the ring.
                     let _ = self.ready.enqueue(Frame { pixels, taken });

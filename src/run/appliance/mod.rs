@@ -9,6 +9,7 @@
 //! A frame buffer is always in exactly one place. When no buffer is free the frame is dropped
 //! and counted; when a record ring is full the record is counted; vision never waits.
 
+mod attendance;
 mod capture;
 mod plc;
 mod vision;
@@ -101,6 +102,7 @@ struct Shared {
     frames_dropped: AtomicU64,
     frames_lost: AtomicU64,
     frames_torn: AtomicU64,
+    frames_missing: AtomicBool,
     feed: Mutex<FeedStatus>,
     imports: ImportBoard,
     progress: Mutex<Progress>,
@@ -140,6 +142,7 @@ impl Shared {
         status.frames_dropped = self.frames_dropped.load(Ordering::Relaxed) + feed.late;
         status.frames_lost = self.frames_lost.load(Ordering::Relaxed);
         status.frames_torn = self.frames_torn.load(Ordering::Relaxed);
+        status.frames_missing = self.frames_missing.load(Ordering::Relaxed);
         (status.camera_absent, status.camera_losses) = (feed.absent, feed.losses);
         status.import = lock(&self.imports);
         progress

@@ -4,7 +4,7 @@ use crate::plc::registers::Status;
 use crate::web::Lamp;
 
 /// Which lamp a code lights: `None` lets `running` go out without any other.
-pub const LAMPS: [(u16, Option<&str>); 18] = [
+pub const LAMPS: [(u16, Option<&str>); 19] = [
     (1, Some(FAILURE)),
     (2, Some(FAILURE)),
     (3, Some(FAILURE)),
@@ -21,6 +21,7 @@ pub const LAMPS: [(u16, Option<&str>); 18] = [
     (16, Some(UNCERTAIN)),
     (17, Some(UNCERTAIN)),
     (18, Some(UNCERTAIN)),
+    (19, Some(UNCERTAIN)),
     (8, None),
     (9, None),
 ];
