@@ -202,6 +202,36 @@ fn what_a_hanging_disk_cost_is_told_in_the_chain_too() {
     assert!((1..=2).contains(&(verdict.entries + lost - 1000)), "{verdict:?}");
 }
 
+static OTHER_DISK_ANSWERS: AtomicBool = AtomicBool::new(false);
+
+fn other_disk_that_hangs(folder: &Path) -> std::io::Result<Space> {
+    while !OTHER_DISK_ANSWERS.load(Ordering::Relaxed) {
+        std::thread::sleep(Duration::from_millis(1));
+    }
+    small_disk(folder)
+}
+
+#[test]
+fn a_disk_that_does_not_answer_is_told_while_it_is_so_before_anything_is_lost() {
+    let folder = folder("silent");
+    let archive = Archive::start_on(&folder, 64 * MIB, other_disk_that_hangs).expect("starts");
+    assert!(!archive.condition().is_bad());
+    archive.put(entry(1, 10));
+    let start = Instant::now();
+    while !archive.condition().is_bad() {
+        assert!(start.elapsed() < PATIENCE, "{:?}", archive.condition());
+        std::thread::sleep(Duration::from_millis(10));
+    }
+    let condition = archive.condition();
+    assert!(condition.lost == 0 && condition.fault.is_some(), "{condition:?}");
+    OTHER_DISK_ANSWERS.store(true, Ordering::Relaxed);
+    while archive.condition().is_bad() {
+        assert!(start.elapsed() < 2 * PATIENCE, "{:?}", archive.condition());
+        std::thread::sleep(Duration::from_millis(10));
+    }
+    archive.finish(PATIENCE);
+}
+
 #[test]
 fn two_processes_do_not_write_one_archive() {
     let folder = folder("two");

@@ -15,6 +15,8 @@ use std::time::{Duration, Instant};
 const RING: usize = 64;
 /// What was written reaches the disk within this.
 const SYNC_PERIOD: Duration = Duration::from_secs(1);
+/// A disk that takes longer than this for an entry hangs.
+const HANGS: Duration = Duration::from_secs(3);
 /// A disk that failed is tried again after this.
 const RETRY: Duration = Duration::from_secs(2);
 /// A segment has at most this share of the archive, and at most so many bytes: it goes as a whole.
@@ -41,6 +43,13 @@ pub struct Condition {
     pub fault: Option<String>,
     /// What was found damaged since start: the chain goes on behind it.
     pub damaged: Option<String>,
+}
+
+impl Condition {
+    /// Whether somebody should look after it.
+    pub fn is_bad(&self) -> bool {
+        self.lost > 0 || self.fault.is_some() || self.damaged.is_some()
+    }
 }
 
 /// A disk's size and what is free on it, bytes.
@@ -72,6 +81,14 @@ struct Shared {
     bytes: AtomicU64,
     fault: Mutex<Option<String>>,
     damaged: Mutex<Option<String>>,
+    /// Since when the writer waits for the disk.
+    waits: Mutex<Option<Instant>>,
+}
+
+impl Shared {
+    fn hangs(&self) -> bool {
+        lock(&self.waits).is_some_and(|since| since.elapsed() > HANGS)
+    }
 }
 
 fn lock<T>(mutex: &Mutex<T>) -> MutexGuard<'_, T> {
@@ -137,7 +154,11 @@ impl Archive {
             lost: count(&self.shared.lost),
             bytes: count(&self.shared.bytes),
             bytes_max: self.bytes_max,
-            fault: lock(&self.shared.fault).clone(),
+            fault: if self.shared.hangs() {
+                Some("the disk does not answer".to_owned())
+            } else {
+                lock(&self.shared.fault).clone()
+            },
             damaged: lock(&self.shared.damaged).clone(),
         }
     }
@@ -186,13 +207,16 @@ impl Writer {
                 .as_ref()
                 .and_then(|open| open.unsynced)
                 .map_or(RETRY, |since| SYNC_PERIOD.saturating_sub(since.elapsed()));
-            match entries.recv_timeout(wait) {
+            let received = entries.recv_timeout(wait);
+            *lock(&self.shared.waits) = Some(Instant::now());
+            match received {
                 Ok(entry) => self.take(&entry),
                 Err(RecvTimeoutError::Timeout) => self.idle(),
                 Err(RecvTimeoutError::Disconnected) => break,
             }
             // Also when entries come without a pause.
             self.sync(SYNC_PERIOD);
+            *lock(&self.shared.waits) = None;
         }
         self.tell_lost();
         self.sync(Duration::ZERO);

@@ -140,6 +140,8 @@ pub struct ArchiveState {
     pub bytes_max: u64,
     /// Why it cannot be written at present.
     pub fault: Option<String>,
+    /// The part of it that was found damaged since start.
+    pub damaged: Option<String>,
 }
 
 /// A parcel as it was told to the PLC.

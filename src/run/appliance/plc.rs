@@ -59,7 +59,9 @@ impl PlcThread<'_> {
                 link.flush();
                 ended_at.get_or_insert(now);
             }
-            link.update(&shared.progress().status, &can.status(), encoder_timeout, now);
+            let mut vision = shared.progress().status;
+            vision.archive_fails = self.insight.archive_fails();
+            link.update(&vision, &can.status(), encoder_timeout, now);
             can.step(link, now);
             while let Some(record) = link.next_published() {
                 let missed = self.published.enqueue(record).is_err();

@@ -13,7 +13,7 @@ use crate::plc::table::{Field, Type, join};
 use crate::run::log;
 use crate::web;
 use std::path::PathBuf;
-use std::sync::atomic::{AtomicU64, Ordering};
+use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
 use std::sync::{Mutex, MutexGuard, PoisonError};
 use std::time::{Duration, Instant, SystemTime, UNIX_EPOCH};
 
@@ -40,6 +40,7 @@ pub struct Insight {
     clients: ClientList,
     frame_time_max: Mutex<Duration>,
     archive: Mutex<Condition>,
+    archive_fails: AtomicBool,
     /// Parcels whose dimensions may be used.
     pub usable: AtomicU64,
     /// Parcels without a picture.
@@ -74,6 +75,7 @@ impl Insight {
             clients,
             frame_time_max: Mutex::default(),
             archive: Mutex::default(),
+            archive_fails: AtomicBool::new(false),
             usable: AtomicU64::new(0),
             pictures_missed: AtomicU64::new(0),
             parcels_missed: AtomicU64::new(0),
@@ -100,8 +102,14 @@ impl Insight {
     pub fn desk_tells(&self, frame_time_max: Duration, archive: Option<Condition>) {
         *lock(&self.frame_time_max) = frame_time_max;
         if let Some(condition) = archive {
+            self.archive_fails.store(condition.is_bad(), Ordering::Relaxed);
             *lock(&self.archive) = condition;
         }
+    }
+
+    /// Whether somebody should look after the archive; never waits.
+    pub fn archive_fails(&self) -> bool {
+        self.archive_fails.load(Ordering::Relaxed)
     }
 
     fn archive_folder(&self) -> Result<&PathBuf, String> {
@@ -118,6 +126,7 @@ impl Insight {
             bytes: condition.bytes,
             bytes_max: condition.bytes_max,
             fault: condition.fault,
+            damaged: condition.damaged,
         }
     }
 }
