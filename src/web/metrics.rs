@@ -40,6 +40,7 @@ fn figures(s: &State) -> Vec<(&'static str, &'static str, &'static str, f64)> {
         ("record_overflows_total", "counter", "records that found a queue full", count(records)),
         ("pictures_missed_total", "counter", "parcels without a picture", count(counts.pictures_missed)),
         ("parcels_missed_total", "counter", "parcels that page and archive were not told of", count(counts.parcels_missed)),
+        ("commands_missed_total", "counter", "commands of the PLC that are no events", count(counts.commands_missed)),
         ("log_lines_dropped_total", "counter", "lines of the log that nobody read", count(counts.log_lines_dropped)),
         ("archive_entries_total", "counter", "entries archived", count(archive.entries_written)),
         ("archive_entries_lost_total", "counter", "entries not archived", count(archive.entries_lost)),

@@ -27,7 +27,7 @@ pub trait Machine: Send + Sync + 'static {
 pub struct State {
     /// Version of the program.
     pub version: &'static str,
-    /// The machine's clock, ms since 1970.
+    /// The machine's clock when this was so, ms since 1970: it stands still when nothing new is known.
     pub utc_ms: u64,
     /// Since start.
     pub uptime_s: f64,
@@ -121,6 +121,8 @@ pub struct Counts {
     pub pictures_missed: u64,
     /// Parcels that page and archive were not told of, because too many came at once.
     pub parcels_missed: u64,
+    /// Commands that are no events, because too many came at once.
+    pub commands_missed: u64,
     /// Lines of the log that nobody read.
     pub log_lines_dropped: u64,
 }

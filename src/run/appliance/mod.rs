@@ -26,6 +26,7 @@ use crate::plan::Block;
 use crate::plc::clients::ClientList;
 use crate::plc::command::Request;
 use crate::plc::journal::Journal;
+use crate::plc::link::Commanded;
 use crate::plc::modbus;
 use crate::plc::registers::{ImportStatus, VisionStatus};
 use crate::source::{Feed, FeedStatus, Taken};
@@ -34,7 +35,7 @@ use capture::Capture;
 use heapless::spsc::Queue;
 use plc::PlcThread;
 use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
-use std::sync::{Arc, Mutex, OnceLock};
+use std::sync::{Arc, Mutex, OnceLock, TryLockError};
 use std::time::{Duration, Instant};
 use vision::Vision;
 
@@ -48,6 +49,8 @@ const SERVICE_STACK_BYTES: usize = 512 * 1024;
 const COUNT_RING: usize = 128;
 /// Requests on their way to vision, and one.
 const REQUEST_RING: usize = 16;
+/// Commands on their way to the desk, and one.
+const COMMAND_RING: usize = 64;
 /// How long a thread sleeps when a ring is empty and nobody has woken it.
 const PARK: Duration = Duration::from_millis(50);
 /// The ends of the threads are looked for this often.
@@ -108,6 +111,23 @@ struct Shared {
     progress: Mutex<Progress>,
 }
 
+/// What is behind the locks, as it was known last.
+#[derive(Clone, Copy, Debug, Default)]
+struct Known {
+    progress: Progress,
+    feed: FeedStatus,
+    import: ImportStatus,
+}
+
+/// Look at what is behind a lock, unless somebody holds it.
+fn renew<T: Copy>(known: &mut T, mutex: &Mutex<T>) {
+    match mutex.try_lock() {
+        Ok(now) => *known = *now,
+        Err(TryLockError::Poisoned(now)) => *known = *now.into_inner(),
+        Err(TryLockError::WouldBlock) => {}
+    }
+}
+
 /// The contents of a lock, whatever happened to who held it.
 fn lock<T: Copy>(mutex: &Mutex<T>) -> T {
     *mutex.lock().unwrap_or_else(std::sync::PoisonError::into_inner)
@@ -135,8 +155,20 @@ impl Shared {
         self.stop.load(Ordering::Relaxed)
     }
 
+    /// For a thread that may wait.
     fn progress(&self) -> Progress {
-        let (mut progress, feed) = (lock(&self.progress), lock(&self.feed));
+        let (progress, feed) = (lock(&self.progress), lock(&self.feed));
+        self.together(Known { progress, feed, import: lock(&self.imports) })
+    }
+
+    /// For a thread that waits for nobody: what is locked stays as it was known.
+    fn renew(&self, known: &mut Known) {
+        renew(&mut known.progress, &self.progress);
+        renew(&mut known.feed, &self.feed);
+        renew(&mut known.import, &self.imports);
+    }
+
+    fn together(&self, Known { mut progress, feed, import }: Known) -> Progress {
         let status = &mut progress.status;
         status.source_ended = self.source_ended.load(Ordering::Relaxed);
         status.frames_dropped = self.frames_dropped.load(Ordering::Relaxed) + feed.late;
@@ -144,7 +176,7 @@ impl Shared {
         status.frames_torn = self.frames_torn.load(Ordering::Relaxed);
         status.frames_missing = self.frames_missing.load(Ordering::Relaxed);
         (status.camera_absent, status.camera_losses) = (feed.absent, feed.losses);
-        status.import = lock(&self.imports);
+        status.import = import;
         progress
     }
 }
@@ -185,7 +217,7 @@ impl Appliance {
         let config = self.site.config.clone();
         let (listener, journal, mut watchdog) = (self.listener, self.journal, self.watchdog);
         let clients = ClientList::new(config.modbus.connections_max);
-        let insight = Arc::new(Insight::new(config.clone(), feed.size_px(), clients.clone()));
+        let insight = Arc::new(Insight::new(config.clone(), feed.size_px(), clients.room()));
         let (page, board) = (self.page, desk::board());
         let encoder = config.encoder.mm_per_count.map(|mm| {
             let speed_max_mm_per_s = ENCODER_SPEED_MAX * config.belt.speed_mm_per_s;
@@ -211,6 +243,9 @@ impl Appliance {
         let (photographer, album) = rings.split();
         let mut to_desk = Queue::<ParcelRecord, RECORD_RING>::new();
         let (published_in, published) = to_desk.split();
+        let mut to_desk = Queue::<Commanded, COMMAND_RING>::new();
+        let (commanded_in, commanded) = to_desk.split();
+        let told = (published, commanded);
         for buffer in buffers {
             // limits.frames_queued_max is below FRAME_RING.
             let _ = free_in.enqueue(buffer);
@@ -222,10 +257,10 @@ impl Appliance {
             let config = &config;
             if desk::shots::wanted(pipeline.site()) {
                 let (insight, board) = (Arc::clone(&insight), Arc::clone(&board));
-                let desk = Desk::new(pipeline.site(), shots, album, published, insight, board)?;
+                let desk = Desk::new(pipeline.site(), shots, album, told, insight, board)?;
                 spawn_service(scope, "desk", move || {
                     shared.desk.get_or_init(std::thread::current);
-                    desk.run(&|| shared.progress(), &|| shared.over.load(Ordering::Acquire))
+                    desk.run(&|| shared.over.load(Ordering::Acquire))
                 })?;
             }
             if let Some(page) = page {
@@ -258,6 +293,7 @@ impl Appliance {
                 counts: count_in,
                 requests: request_in,
                 published: published_in,
+                commanded: commanded_in,
                 insight: Arc::clone(&insight),
                 shared,
             };
@@ -347,4 +383,29 @@ fn watch_the_end(threads: [&Handle<'_>; 3], watchdog: &mut Watchdog, beats: &Bea
 /// Wait for a thread; a panic in it is a broken invariant and goes on here.
 fn join(handle: Handle<'_>) -> Result<()> {
     handle.join().unwrap_or_else(|panic| std::panic::resume_unwind(panic))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn what_is_locked_stays_as_it_was_known_and_nobody_waits() {
+        let (shared, mut known) = (Shared::default(), Known::default());
+        lock_of(&shared.feed).losses = 1;
+        shared.renew(&mut known);
+        let mut held = (lock_of(&shared.feed), lock_of(&shared.progress), lock_of(&shared.imports));
+        (held.0.losses, held.2.count) = (2, 9);
+        // It would wait for ever.
+        shared.renew(&mut known);
+        assert_eq!((known.feed.losses, known.import.count), (1, 0));
+        drop(held);
+        shared.renew(&mut known);
+        let status = shared.together(known).status;
+        assert_eq!((status.camera_losses, status.import.count), (2, 9));
+    }
+
+    fn lock_of<T>(mutex: &Mutex<T>) -> std::sync::MutexGuard<'_, T> {
+        mutex.lock().expect("whole")
+    }
 }

@@ -16,12 +16,12 @@ pub mod shots;
 pub use insight::{Insight, is_due};
 pub use shots::{Album, Photographer, Rings, Shot};
 
-use super::appliance::Progress;
 use super::realtime;
 use crate::archive::{self, Archive};
 use crate::config::{Config, DimensionOrder, Site};
 use crate::error::{Error, Result};
 use crate::event::ParcelRecord;
+use crate::plc::link::Commanded;
 use crate::web::{self, Board, View};
 use heapless::spsc::Consumer;
 use insight::utc_ms;
@@ -57,6 +57,8 @@ pub struct Desk<'a> {
     pub album: Album<'a>,
     /// What the PLC was told.
     pub published: Consumer<'a, ParcelRecord>,
+    /// What the PLC has commanded.
+    pub commanded: Consumer<'a, Commanded>,
     /// What the page asks.
     pub insight: Arc<Insight>,
     /// What the page shows.
@@ -98,7 +100,7 @@ impl<'a> Desk<'a> {
         site: &Site,
         shots: Vec<Shot>,
         mut album: Album<'a>,
-        published: Consumer<'a, ParcelRecord>,
+        (published, commanded): (Consumer<'a, ParcelRecord>, Consumer<'a, Commanded>),
         insight: Arc<Insight>,
         board: Arc<Board>,
     ) -> Result<Self> {
@@ -119,6 +121,7 @@ impl<'a> Desk<'a> {
         Ok(Self {
             album,
             published,
+            commanded,
             insight,
             board,
             geometry: Geometry::new(site),
@@ -132,22 +135,30 @@ impl<'a> Desk<'a> {
     }
 
     /// Until it is over; what came before is told.
-    pub fn run(mut self, progress: &dyn Fn() -> Progress, over: &dyn Fn() -> bool) -> Result<()> {
+    pub fn run(mut self, over: &dyn Fn() -> bool) -> Result<()> {
         realtime::stand_back();
         self.board.is_served_here();
-        self.happened(event(utc_ms(), "started", 0, env!("CARGO_PKG_VERSION").to_owned()));
+        let mut started = false;
         loop {
             // Asked before the rings are emptied.
             let over = over();
             self.take_shots()?;
-            while let Some(record) = self.published.dequeue() {
+            // The first entry says which start of the machine this is: the PLC's thread knows.
+            if !started && (over || self.insight.plc_side().is_known()) {
+                started = true;
+                self.happened(event(utc_ms(), "started", 0, env!("CARGO_PKG_VERSION").to_owned()));
+            }
+            while started && let Some(record) = self.published.dequeue() {
                 self.parcel(record);
+            }
+            while started && let Some(given) = self.commanded.dequeue() {
+                self.happened(news::command(utc_ms(), &given));
             }
             let now = Instant::now();
             if over || self.looked.is_none_or(|at| now - at >= NEWS) {
                 self.looked = Some(now);
                 let condition = self.archive.as_ref().map(Archive::condition);
-                self.insight.desk_tells(progress().frame_time_max, condition);
+                self.insight.desk_tells(condition);
                 for event in self.news.look(&self.insight.plc_side(), utc_ms(), now) {
                     self.happened(event);
                 }
