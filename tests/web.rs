@@ -68,7 +68,11 @@ impl Server {
     }
 
     fn of(machine: Arc<dyn Machine>) -> Self {
-        let settings = Web { address: [127, 0, 0, 1].into(), port: 0, ..Web::default() };
+        Self::with(Web::default(), machine)
+    }
+
+    fn with(settings: Web, machine: Arc<dyn Machine>) -> Self {
+        let settings = Web { address: [127, 0, 0, 1].into(), port: 0, ..settings };
         let listening = web::listen(&settings);
         let address = listening.as_ref().expect("bound").local_addr().expect("bound");
         let board = Arc::new(Board::new(5));
@@ -259,6 +263,25 @@ fn of_a_hundred_at_once_as_many_are_served_as_have_places_and_others_find_one() 
     assert_eq!(served, Web::default().connections_max / 2);
     let mut other = connect_from([127, 0, 0, 2], server.address);
     assert!(is_served(&mut other), "another visitor is locked out");
+}
+
+#[test]
+fn who_is_not_named_among_those_who_may_look_is_told_so_and_sees_nothing() {
+    let allow = vec!["127.0.0.2".parse().expect("an address")];
+    let server = Server::with(Web { allow, ..Web::default() }, Arc::new(Still));
+    for path in ["/", "/api/state", "/metrics", "/main.js", "/api/archive/7/picture"] {
+        let answer = server.get(path);
+        assert_eq!(status(&answer), 403, "{path}");
+        assert!(answer.contains("web.allow") && !answer.contains("1.2.3"), "{answer}");
+        assert!(answer.to_lowercase().contains("content-security-policy"), "{answer}");
+    }
+    let mut named = connect_from([127, 0, 0, 2], server.address);
+    named
+        .write_all(b"GET /api/state HTTP/1.1\r\nHost: localhost\r\nConnection: close\r\n\r\n")
+        .expect("open");
+    let mut answer = String::new();
+    named.read_to_string(&mut answer).expect("answered");
+    assert!(status(&answer) == 200 && answer.contains("1.2.3"), "{answer}");
 }
 
 #[test]

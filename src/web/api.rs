@@ -66,6 +66,16 @@ pub(super) fn router(board: Arc<Board>, machine: Arc<dyn Machine>, settings: &Se
         .with_state(Sources { patience, board, machine, questions })
 }
 
+/// For visitors whom `web.allow` does not name: nothing but why.
+pub(super) fn closed() -> Router {
+    let text = "this address may not see the page: put it into web.allow";
+    let protected = |mut answer: Response| {
+        guard::protect(answer.headers_mut());
+        answer
+    };
+    Router::new().fallback(move || async move { protected(refusal(StatusCode::FORBIDDEN, text)) })
+}
+
 /// An answer that says what was wrong.
 fn refusal(status: StatusCode, text: &'static str) -> Response {
     (status, text).into_response()

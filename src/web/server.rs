@@ -114,7 +114,9 @@ async fn accept(
             Ok((stream, address)) => {
                 // One too many is hung up on.
                 if let Some(visit) = door.admit(address.ip()) {
-                    tokio::spawn(receive(stream, visit, router.clone()));
+                    let admitted = settings.admits(address.ip());
+                    let router = if admitted { router.clone() } else { api::closed() };
+                    tokio::spawn(receive(stream, visit, router));
                 }
             }
             Err(_) => tokio::time::sleep(ACCEPT_RETRY).await,
