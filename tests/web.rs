@@ -4,7 +4,7 @@ use beltgauge::config::Web;
 use beltgauge::event::{Flags, NotMeasured, ParcelRecord, Shape};
 use beltgauge::plc::command::COMMANDS;
 use beltgauge::plc::registers::REASONS;
-use beltgauge::web::{self, Archived, Board, Event, Machine, Parcel, Plc, State, View};
+use beltgauge::web::{self, Archived, Board, Event, Machine, NoPicture, Parcel, Plc, State, View};
 use std::collections::{BTreeMap, BTreeSet};
 use std::io::{ErrorKind, Read, Write};
 use std::net::{SocketAddr, TcpStream};
@@ -366,7 +366,7 @@ fn parcel(seq: u32) -> Parcel {
         belt_travel_mm: 1712.5,
         by_encoder: false,
     };
-    Parcel { n: 0, utc_ms: 1_795_000_000_123, record, picture: None }
+    Parcel { n: 0, utc_ms: 1_795_000_000_123, record, picture: None, no_picture: Some(NoPicture::TooMany) }
 }
 
 #[test]
@@ -451,6 +451,10 @@ fn every_word_is_there_in_both_languages() {
     needed.extend(COMMANDS.iter().map(|(code, _)| format!("command.{code}")));
     for (code, _) in REASONS {
         needed.extend([format!("reason.{code}"), format!("remedy.{code}")]);
+    }
+    for why in NoPicture::ALL {
+        let name = serde_json::to_value(why).expect("a word");
+        needed.insert(format!("no_picture.{}", name.as_str().expect("a word")));
     }
     for kind in ["started", "stopped", "began", "ended", "camera_lost", "command", "import"] {
         needed.insert(format!("event.{kind}"));

@@ -38,7 +38,7 @@ fn figures(s: &State) -> Vec<(&'static str, &'static str, &'static str, f64)> {
         ("segment_overflows_total", "counter", "frames with too many runs or blobs", count(segments)),
         ("track_overflows_total", "counter", "blobs without a free track", count(tracks)),
         ("record_overflows_total", "counter", "records that found a queue full", count(records)),
-        ("pictures_missed_total", "counter", "parcels without a picture", count(counts.pictures_missed)),
+        ("pictures_missed_total", "counter", "parcels without a picture because too many came at once", count(counts.pictures_missed)),
         ("parcels_missed_total", "counter", "parcels that page and archive were not told of", count(counts.parcels_missed)),
         ("commands_missed_total", "counter", "commands of the PLC that are no events", count(counts.commands_missed)),
         ("log_lines_dropped_total", "counter", "lines of the log that nobody read", count(counts.log_lines_dropped)),

@@ -158,6 +158,23 @@ pub struct Parcel {
     pub record: ParcelRecord,
     /// Its picture, if there is one.
     pub picture: Option<ParcelPicture>,
+    /// Why there is none.
+    pub no_picture: Option<NoPicture>,
+}
+
+/// Why there is no picture of a parcel.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize)]
+#[serde(rename_all = "snake_case")]
+pub enum NoPicture {
+    /// Too many came at once.
+    TooMany,
+    /// It was not followed through the middle of the zone, where pictures are taken.
+    NotInMiddle,
+}
+
+impl NoPicture {
+    /// All of them.
+    pub const ALL: [Self; 2] = [Self::TooMany, Self::NotInMiddle];
 }
 
 /// What belongs to a parcel's picture.

@@ -44,7 +44,7 @@ pub struct Insight {
     archive_fails: AtomicBool,
     /// Parcels whose dimensions may be used.
     pub usable: AtomicU64,
-    /// Parcels without a picture.
+    /// Parcels without a picture, because too many came at once.
     pub pictures_missed: AtomicU64,
     /// Parcels that the desk was not told of.
     pub parcels_missed: AtomicU64,

@@ -22,7 +22,7 @@ use crate::config::{Config, DimensionOrder, Site};
 use crate::error::{Error, Result};
 use crate::event::ParcelRecord;
 use crate::plc::link::Commanded;
-use crate::web::{self, Board, View};
+use crate::web::{self, Board, NoPicture, View};
 use heapless::spsc::Consumer;
 use insight::utc_ms;
 use jpeg_encoder::{ColorType, Encoder};
@@ -69,6 +69,8 @@ pub struct Desk<'a> {
     /// Live shots that are here, and when each kind was last asked for.
     live: [(Option<Shot>, Option<Instant>); LIVE],
     waiting: VecDeque<Waiting>,
+    /// The last frames with a parcel that there was no room for a picture of.
+    missed: Missed,
     news: News,
     looked: Option<Instant>,
 }
@@ -78,6 +80,24 @@ struct Waiting {
     framing: Framing,
     sight: crate::pipeline::Sight,
     jpeg: Vec<u8>,
+}
+
+/// Frames with a parcel that there was no room for a picture of.
+#[derive(Default)]
+struct Missed(VecDeque<u64>);
+
+impl Missed {
+    fn note(&mut self, frame: u64) {
+        if self.0.len() == WAITING_MAX {
+            self.0.pop_front();
+        }
+        self.0.push_back(frame);
+    }
+
+    /// Why there is no picture of a parcel whose record is of a frame.
+    fn why(&self, frame: u64) -> NoPicture {
+        if self.0.contains(&frame) { NoPicture::TooMany } else { NoPicture::NotInMiddle }
+    }
 }
 
 /// An entry of the archive.
@@ -129,6 +149,7 @@ impl<'a> Desk<'a> {
             config,
             live,
             waiting: VecDeque::new(),
+            missed: Missed::default(),
             news: News::new(Instant::now()),
             looked: None,
         })
@@ -197,6 +218,9 @@ impl<'a> Desk<'a> {
     }
 
     fn take_shots(&mut self) -> Result<()> {
+        while let Some(frame) = self.album.missed.dequeue() {
+            self.missed.note(frame);
+        }
         while let Some(shot) = self.album.taken.dequeue() {
             match shot.framing.subject {
                 Subject::Raw => self.put_up(View::Raw, shot)?,
@@ -225,8 +249,10 @@ impl<'a> Desk<'a> {
         let Some(sight) = shot.sights.first() else { return Ok(()) };
         let mut jpeg = Vec::new();
         encode(&stretched(shot.pixels()), shot.framing.size_px, PARCEL_QUALITY, &mut jpeg)?;
-        if self.waiting.len() == WAITING_MAX {
-            self.waiting.pop_front();
+        if self.waiting.len() == WAITING_MAX
+            && let Some(oldest) = self.waiting.pop_front()
+        {
+            self.missed.note(oldest.framing.time.index);
         }
         self.waiting.push_back(Waiting { framing: shot.framing, sight: *sight, jpeg });
         Ok(())
@@ -246,7 +272,8 @@ impl<'a> Desk<'a> {
 
     fn parcel(&mut self, record: ParcelRecord) {
         let waiting = self.picture_of(&record);
-        if waiting.is_none() {
+        let no_picture = waiting.is_none().then(|| self.missed.why(record.frame));
+        if no_picture == Some(NoPicture::TooMany) {
             self.insight.pictures_missed.fetch_add(1, Ordering::Relaxed);
         }
         self.insight.usable.fetch_add(u64::from(record.may_be_used), Ordering::Relaxed);
@@ -259,7 +286,7 @@ impl<'a> Desk<'a> {
         let jpeg = waiting.map(|waiting| waiting.jpeg).unwrap_or_default();
         // What the PLC's rounding left behind the last digit is noise.
         let record = record.rounded();
-        let parcel = web::Parcel { n: 0, utc_ms: utc_ms(), record, picture };
+        let parcel = web::Parcel { n: 0, utc_ms: utc_ms(), record, picture, no_picture };
         let parcel = self.board.parcel(parcel, jpeg.clone());
         self.archive(archive::Kind::Parcel, parcel.utc_ms, &*parcel, jpeg);
     }
@@ -315,6 +342,15 @@ fn stretched(pixels: &[u8]) -> Vec<u8> {
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn why_there_is_no_picture_is_known_of_the_last_frames() {
+        let mut missed = Missed::default();
+        (0..1000).for_each(|frame| missed.note(2 * frame));
+        assert_eq!(missed.why(1998), NoPicture::TooMany);
+        assert_eq!(missed.why(1997), NoPicture::NotInMiddle);
+        assert_eq!(missed.0.len(), WAITING_MAX);
+    }
 
     #[test]
     fn a_dark_picture_is_stretched_and_a_plain_one_stays_plain() {
