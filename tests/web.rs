@@ -366,7 +366,13 @@ fn parcel(seq: u32) -> Parcel {
         belt_travel_mm: 1712.5,
         by_encoder: false,
     };
-    Parcel { n: 0, utc_ms: 1_795_000_000_123, record, picture: None, no_picture: Some(NoPicture::TooMany) }
+    Parcel {
+        n: 0,
+        utc_ms: 1_795_000_000_123,
+        record,
+        picture: None,
+        no_picture: Some(NoPicture::TooMany),
+    }
 }
 
 #[test]

@@ -19,7 +19,7 @@ use super::memory::Carved;
 use super::realtime;
 use super::watchdog::{Beats, Watchdog};
 use crate::belt::Encoder;
-use crate::config::Site;
+use crate::config::{Config, Site};
 use crate::error::{Error, Result};
 use crate::event::ParcelRecord;
 use crate::plan::Block;
@@ -219,10 +219,7 @@ impl Appliance {
         let clients = ClientList::new(config.modbus.connections_max);
         let insight = Arc::new(Insight::new(config.clone(), feed.size_px(), clients.room()));
         let (page, board) = (self.page, desk::board());
-        let encoder = config.encoder.mm_per_count.map(|mm| {
-            let speed_max_mm_per_s = ENCODER_SPEED_MAX * config.belt.speed_mm_per_s;
-            Encoder::new(mm, config.encoder.bits, config.encoder.timeout_s, speed_max_mm_per_s)
-        });
+        let encoder = encoder(&config);
         let Carved { buffers, pipeline, shots } = super::memory::carve(self.site)?;
         realtime::lock_memory(&config.realtime)?;
         let shared = Shared { imports: self.imports, ..Shared::default() };
@@ -245,30 +242,36 @@ impl Appliance {
         let (published_in, published) = to_desk.split();
         let mut to_desk = Queue::<Commanded, COMMAND_RING>::new();
         let (commanded_in, commanded) = to_desk.split();
-        let told = (published, commanded);
         for buffer in buffers {
             // limits.frames_queued_max is below FRAME_RING.
             let _ = free_in.enqueue(buffer);
         }
         std::thread::scope(|scope| {
-            let shared = &shared;
+            let (shared, config) = (&shared, &config);
             // However this closure is left, the threads must end, or the scope waits for ever.
-            let _stop = StopOnDrop { shared, board: &board };
-            let config = &config;
+            let stop = StopOnDrop { shared, board: &board };
+            let mut services = Vec::new();
             if desk::shots::wanted(pipeline.site()) {
                 let (insight, board) = (Arc::clone(&insight), Arc::clone(&board));
-                let desk = Desk::new(pipeline.site(), shots, album, told, insight, board)?;
-                spawn_service(scope, "desk", move || {
+                let desk = Desk::new(
+                    pipeline.site(),
+                    shots,
+                    album,
+                    (published, commanded),
+                    insight,
+                    board,
+                )?;
+                let desk = move || {
                     shared.desk.get_or_init(std::thread::current);
-                    desk.run(&|| shared.over.load(Ordering::Acquire))
-                })?;
+                    desk.run(&|| shared.over.load(Ordering::Acquire));
+                    Ok(())
+                };
+                services.push(spawn_service(scope, "desk", shared, desk)?);
             }
             if let Some(page) = page {
                 let (insight, board) = (Arc::clone(&insight), Arc::clone(&board));
-                spawn_service(scope, "web", move || {
-                    realtime::stand_back();
-                    web::serve(&config.web, page, &board, insight)
-                })?;
+                let web = move || web::serve(&config.web, page, &board, insight);
+                services.push(spawn_service(scope, "web", shared, web)?);
             }
             let vision = Vision {
                 pipeline,
@@ -298,7 +301,8 @@ impl Appliance {
                 shared,
             };
             let plc = spawn(scope, "plc", move || plc.run())?;
-            while !(capture.is_finished() || vision.is_finished() || plc.is_finished()) {
+            let measuring = [capture, vision, plc];
+            while !measuring.iter().chain(&services).any(Handle::is_finished) {
                 std::thread::park_timeout(PARK);
                 watchdog.look(&shared.beats, [true; 3]);
                 let mut records = std::iter::from_fn(|| observer_out.dequeue());
@@ -306,17 +310,20 @@ impl Appliance {
                     break;
                 }
             }
-            // They end in the order of the flow, so that every frame and record arrives.
-            shared.stop.store(true, Ordering::Relaxed);
-            watch_the_end([&capture, &vision, &plc], &mut watchdog, &shared.beats);
-            let captured = join(capture);
-            let seen = join(vision);
-            let served = join(plc);
+            let measured = end_in_order(measuring, &mut watchdog, shared);
             observe(&shared.progress(), &mut std::iter::from_fn(|| observer_out.dequeue()));
             watchdog.disarm();
-            captured.and(seen).and(served).map(|()| shared.progress())
+            drop(stop);
+            measured.and(services.into_iter().try_for_each(join)).map(|()| shared.progress())
         })
     }
+}
+
+fn encoder(config: &Config) -> Option<Encoder> {
+    let encoder = &config.encoder;
+    let speed_max_mm_per_s = ENCODER_SPEED_MAX * config.belt.speed_mm_per_s;
+    let of = |mm| Encoder::new(mm, encoder.bits, encoder.timeout_s, speed_max_mm_per_s);
+    encoder.mm_per_count.map(of)
 }
 
 /// Lets every thread end.
@@ -349,23 +356,35 @@ fn spawn<'scope, 'env>(
         .map_err(|e| Error::failure(format!("cannot start the {name} thread: {e}")))
 }
 
-/// Start a thread that nobody waits for and whose failure is told, and is no reason to stop measuring.
-fn spawn_service<'scope>(
-    scope: &'scope std::thread::Scope<'scope, '_>,
+/// Start a thread that nobody waits for. One that ends before all is over ends the run: a page or an
+/// archive that is dead for good looks like one where nothing happens.
+fn spawn_service<'scope, 'env>(
+    scope: &'scope std::thread::Scope<'scope, 'env>,
     name: &'static str,
+    shared: &'scope Shared,
     body: impl FnOnce() -> Result<()> + Send + 'scope,
-) -> Result<()> {
+) -> Result<Handle<'scope>> {
     let told = move || {
-        if let Err(e) = body() {
-            tracing::error!("the {name} thread has ended: {e}");
+        realtime::stand_back();
+        let ended = body();
+        if shared.over.load(Ordering::Acquire) {
+            return ended;
         }
+        Err(ended.err().unwrap_or_else(|| Error::failure(format!("the {name} thread has ended"))))
     };
     std::thread::Builder::new()
         .name(name.to_owned())
         .stack_size(SERVICE_STACK_BYTES)
         .spawn_scoped(scope, told)
-        .map(drop)
         .map_err(|e| Error::failure(format!("cannot start the {name} thread: {e}")))
+}
+
+/// They end in the order of the flow, so that every frame and record arrives.
+fn end_in_order(threads: [Handle<'_>; 3], watchdog: &mut Watchdog, shared: &Shared) -> Result<()> {
+    shared.stop.store(true, Ordering::Relaxed);
+    watch_the_end(threads.each_ref(), watchdog, &shared.beats);
+    // Every one is joined, however the one before has ended.
+    threads.map(join).into_iter().collect()
 }
 
 /// Watch the threads until all have ended.
@@ -388,6 +407,21 @@ fn join(handle: Handle<'_>) -> Result<()> {
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn a_service_that_ends_before_all_is_over_ends_the_run() {
+        let shared = Shared::default();
+        std::thread::scope(|scope| {
+            let ended = |result: Result<()>| {
+                join(spawn_service(scope, "desk", &shared, || result).expect("starts"))
+            };
+            assert!(ended(Ok(())).is_err_and(|e| e.to_string().contains("the desk thread")));
+            let failed = ended(Err(Error::failure("no more of it")));
+            assert!(failed.is_err_and(|e| e.to_string().contains("no more of it")));
+            shared.end_all();
+            assert!(ended(Ok(())).is_ok());
+        });
+    }
 
     #[test]
     fn what_is_locked_stays_as_it_was_known_and_nobody_waits() {

@@ -16,7 +16,6 @@ pub mod shots;
 pub use insight::{Insight, is_due};
 pub use shots::{Album, Photographer, Rings, Shot};
 
-use super::realtime;
 use crate::archive::{self, Archive};
 use crate::config::{Config, DimensionOrder, Site};
 use crate::error::{Error, Result};
@@ -156,14 +155,13 @@ impl<'a> Desk<'a> {
     }
 
     /// Until it is over; what came before is told.
-    pub fn run(mut self, over: &dyn Fn() -> bool) -> Result<()> {
-        realtime::stand_back();
+    pub fn run(mut self, over: &dyn Fn() -> bool) {
         self.board.is_served_here();
         let mut started = false;
         loop {
             // Asked before the rings are emptied.
             let over = over();
-            self.take_shots()?;
+            self.take_shots();
             // The first entry says which start of the machine this is: the PLC's thread knows.
             if !started && (over || self.insight.plc_side().is_known()) {
                 started = true;
@@ -194,7 +192,6 @@ impl<'a> Desk<'a> {
         if let Some(archive) = self.archive {
             archive.finish(FAREWELL);
         }
-        Ok(())
     }
 
     /// Ask for the live pictures that somebody waits for; returns how long to sleep.
@@ -217,30 +214,33 @@ impl<'a> Desk<'a> {
         sleep
     }
 
-    fn take_shots(&mut self) -> Result<()> {
+    fn take_shots(&mut self) {
         while let Some(frame) = self.album.missed.dequeue() {
             self.missed.note(frame);
         }
         while let Some(shot) = self.album.taken.dequeue() {
             match shot.framing.subject {
-                Subject::Raw => self.put_up(View::Raw, shot)?,
-                Subject::Belt => self.put_up(View::Belt, shot)?,
+                Subject::Raw => self.put_up(View::Raw, shot),
+                Subject::Belt => self.put_up(View::Belt, shot),
                 Subject::Parcel => {
-                    self.keep(&shot)?;
+                    tell_failure(self.keep(&shot));
                     let _ = self.album.spare.enqueue(shot); // invariant: there is room for all
                 }
             }
         }
-        Ok(())
     }
 
-    fn put_up(&mut self, view: View, shot: Shot) -> Result<()> {
-        let scene = self.geometry.scene(&shot);
+    fn put_up(&mut self, view: View, shot: Shot) {
+        tell_failure(self.show(view, &shot));
+        self.live[view as usize].0 = Some(shot);
+    }
+
+    fn show(&self, view: View, shot: &Shot) -> Result<()> {
+        let scene = self.geometry.scene(shot);
         let mut bytes = json(&scene)?.into_bytes();
         bytes.push(b'\n');
         encode(shot.pixels(), shot.framing.size_px, LIVE_QUALITY, &mut bytes)?;
         self.board.picture(view, scene.frame, bytes);
-        self.live[view as usize].0 = Some(shot);
         Ok(())
     }
 
@@ -303,6 +303,13 @@ impl<'a> Desk<'a> {
         if let Ok(text) = json(&kept) {
             archive.put(archive::Entry { kind, utc_ms, text, picture });
         }
+    }
+}
+
+/// A picture that fails is no reason to make no others.
+fn tell_failure(made: Result<()>) {
+    if let Err(e) = made {
+        tracing::error!("{e}");
     }
 }
 
