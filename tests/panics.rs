@@ -2,12 +2,16 @@
 //!
 //! The test starts itself as another process, which runs an appliance and panics where it is told to.
 
+use beltgauge::config::Web;
 use beltgauge::error::Result;
 use beltgauge::image::FrameTime;
 use beltgauge::run::{Appliance, demo, end_on_panic};
 use beltgauge::source::synthetic::Synthetic;
 use beltgauge::source::{FrameSource, Pace, Paced};
+use beltgauge::web::{self, Archived, Board, Machine, Plc, State};
+use std::io::{Read, Write};
 use std::process::{Command, Stdio};
+use std::sync::Arc;
 use std::time::{Duration, Instant};
 
 /// Where to panic, for the other process.
@@ -75,13 +79,56 @@ fn an_appliance_that_panics() {
     unreachable!("it ended in order: {ended:?}");
 }
 
+/// A machine that panics when its page is asked for its state.
+struct Panicking;
+
+impl Machine for Panicking {
+    fn state(&self) -> State {
+        panics()
+    }
+    fn plc(&self) -> Plc {
+        Plc::default()
+    }
+    fn archived(&self, _: Option<u64>, _: usize) -> std::result::Result<Archived, String> {
+        panics()
+    }
+    fn archived_picture(&self, _: u64) -> Option<Vec<u8>> {
+        None
+    }
+}
+
+#[test]
+#[ignore = "another process of the test below"]
+fn a_page_that_panics() {
+    let Ok(place) = std::env::var(PLACE) else { return };
+    end_on_panic();
+    let path = if place == "page" { "/api/state" } else { "/api/archive" };
+    let settings = Web { address: [127, 0, 0, 1].into(), port: 0, ..Web::default() };
+    let listening = web::listen(&settings);
+    let address = listening.as_ref().expect("bound").local_addr().expect("bound");
+    std::thread::spawn(move || {
+        let mut visitor = std::net::TcpStream::connect(address).expect("listens");
+        let request = format!("GET {path} HTTP/1.1\r\nHost: localhost\r\n\r\n");
+        visitor.write_all(request.as_bytes()).expect("open");
+        let _ = visitor.read_to_end(&mut Vec::new());
+    });
+    let board = Arc::new(Board::new(0));
+    let ended = web::serve(&settings, listening, &board, Arc::new(Panicking));
+    unreachable!("it ended in order: {ended:?}");
+}
+
 /// Panic so many times in each place.
 fn panic_everywhere(times: u32) {
     let this = std::env::current_exe().expect("a path");
-    for place in ["capture", "main", "any other"] {
+    for place in ["capture", "main", "any other", "page", "page's reader"] {
+        let test = if place.starts_with("page") {
+            "a_page_that_panics"
+        } else {
+            "an_appliance_that_panics"
+        };
         for run in 0..times {
             let mut process = Command::new(&this)
-                .args(["--exact", "an_appliance_that_panics", "--ignored", "--nocapture"])
+                .args(["--exact", test, "--ignored", "--nocapture"])
                 .env(PLACE, place)
                 .stdout(Stdio::piped())
                 .stderr(Stdio::null())

@@ -4,7 +4,7 @@ use beltgauge::config::Web;
 use beltgauge::event::{Flags, NotMeasured, ParcelRecord, Shape};
 use beltgauge::plc::command::COMMANDS;
 use beltgauge::plc::registers::REASONS;
-use beltgauge::web::{self, Archived, Board, Event, Machine, Parcel, Plc, State, View};
+use beltgauge::web::{self, Archived, Board, Event, Machine, NoPicture, Parcel, Plc, State, View};
 use std::collections::{BTreeMap, BTreeSet};
 use std::io::{ErrorKind, Read, Write};
 use std::net::{SocketAddr, TcpStream};
@@ -68,7 +68,11 @@ impl Server {
     }
 
     fn of(machine: Arc<dyn Machine>) -> Self {
-        let settings = Web { address: [127, 0, 0, 1].into(), port: 0, ..Web::default() };
+        Self::with(Web::default(), machine)
+    }
+
+    fn with(settings: Web, machine: Arc<dyn Machine>) -> Self {
+        let settings = Web { address: [127, 0, 0, 1].into(), port: 0, ..settings };
         let listening = web::listen(&settings);
         let address = listening.as_ref().expect("bound").local_addr().expect("bound");
         let board = Arc::new(Board::new(5));
@@ -262,6 +266,25 @@ fn of_a_hundred_at_once_as_many_are_served_as_have_places_and_others_find_one() 
 }
 
 #[test]
+fn who_is_not_named_among_those_who_may_look_is_told_so_and_sees_nothing() {
+    let allow = vec!["127.0.0.2".parse().expect("an address")];
+    let server = Server::with(Web { allow, ..Web::default() }, Arc::new(Still));
+    for path in ["/", "/api/state", "/metrics", "/main.js", "/api/archive/7/picture"] {
+        let answer = server.get(path);
+        assert_eq!(status(&answer), 403, "{path}");
+        assert!(answer.contains("web.allow") && !answer.contains("1.2.3"), "{answer}");
+        assert!(answer.to_lowercase().contains("content-security-policy"), "{answer}");
+    }
+    let mut named = connect_from([127, 0, 0, 2], server.address);
+    named
+        .write_all(b"GET /api/state HTTP/1.1\r\nHost: localhost\r\nConnection: close\r\n\r\n")
+        .expect("open");
+    let mut answer = String::new();
+    named.read_to_string(&mut answer).expect("answered");
+    assert!(status(&answer) == 200 && answer.contains("1.2.3"), "{answer}");
+}
+
+#[test]
 fn who_asks_a_byte_at_a_time_is_ended_and_others_are_served() {
     let server = Server::start();
     let mut slow = server.connect();
@@ -343,7 +366,13 @@ fn parcel(seq: u32) -> Parcel {
         belt_travel_mm: 1712.5,
         by_encoder: false,
     };
-    Parcel { n: 0, utc_ms: 1_795_000_000_123, record, picture: None }
+    Parcel {
+        n: 0,
+        utc_ms: 1_795_000_000_123,
+        record,
+        picture: None,
+        no_picture: Some(NoPicture::TooMany),
+    }
 }
 
 #[test]
@@ -428,6 +457,10 @@ fn every_word_is_there_in_both_languages() {
     needed.extend(COMMANDS.iter().map(|(code, _)| format!("command.{code}")));
     for (code, _) in REASONS {
         needed.extend([format!("reason.{code}"), format!("remedy.{code}")]);
+    }
+    for why in NoPicture::ALL {
+        let name = serde_json::to_value(why).expect("a word");
+        needed.insert(format!("no_picture.{}", name.as_str().expect("a word")));
     }
     for kind in ["started", "stopped", "began", "ended", "camera_lost", "command", "import"] {
         needed.insert(format!("event.{kind}"));

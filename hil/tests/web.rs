@@ -127,8 +127,10 @@ const STRANGE_WORDS: &str = r#"
     const real = window.fetch;
     const told = (value, key) => {
         if (typeof value === 'string') return value === 'parcel' ? value : window.strange + value;
+        // What is wrong with the archive is shown with its reason.
+        if (key === 'reasons') return [...value, 20];
         if (Array.isArray(value)) return value.map((item) => told(item, key));
-        if (value === null) return ['fault', 'can_interface'].includes(key) ? window.strange : null;
+        if (value === null) return ['fault', 'damaged', 'can_interface'].includes(key) ? window.strange : null;
         if (typeof value !== 'object') return value;
         return Object.fromEntries(Object.entries(value).map(([key, value]) => [key, told(value, key)]));
     };
@@ -169,5 +171,36 @@ async fn words_from_outside_are_text_on_every_page() {
     assert_ne!(browser.run("return document.title").await, "taken");
     let console = browser.console().await.concat();
     assert!(console.contains("Content Security Policy"), "its script was refused: {console}");
+    browser.end().await;
+}
+
+/// The state stands still, as when the thread that tells it hangs; or it cannot be had.
+const OLD_STATE: &str = r"
+    window.real ??= window.fetch;
+    let first = null;
+    window.fetch = async (path, options) => {
+        if (path !== '/api/state' || window.how === 'moves') return window.real(path, options);
+        if (window.how === 'fails') return new Response('no', { status: 500 });
+        first ??= await (await window.real(path, options)).text();
+        return new Response(first);
+    };
+";
+
+#[tokio::test(flavor = "multi_thread")]
+async fn lamps_of_an_old_state_are_grey_and_the_page_says_so() {
+    let demo = Demo::start("web-old", 600, false);
+    let browser = Browser::start([1400, 1100]).await;
+    browser.client.goto(&format!("http://{}/", demo.page)).await.expect("it opens");
+    let lit = "return document.querySelector('#lamps .on') !== null && document.getElementById('offline').hidden";
+    let grey = "return document.querySelectorAll('#lamps li').length === 4
+        && document.querySelector('#lamps .on') === null && !document.getElementById('offline').hidden";
+    browser.wait("lit lamps", lit).await;
+    browser.run(OLD_STATE).await;
+    browser.wait("grey lamps", grey).await;
+    browser.screenshot(&demo.out.join("old.png")).await;
+    browser.run("window.how = 'moves'").await;
+    browser.wait("lit lamps again", lit).await;
+    browser.run("window.how = 'fails'").await;
+    browser.wait("grey lamps again", grey).await;
     browser.end().await;
 }

@@ -8,7 +8,8 @@
 //! before it and itself, over segments too. A power cut costs what was not yet synchronised, a second's
 //! entries; what it left half-written is found by its sum and passed over. Whoever changes or takes out
 //! an entry breaks the chain; whoever may write the disk can forge a whole new one, unless the last sum
-//! was noted elsewhere. A slow, full or broken disk costs entries, which are counted: nobody waits for it.
+//! was noted elsewhere. What is damaged or cannot be read is told and left as it is: a new segment goes
+//! on behind it. A slow, full or broken disk costs entries, which are counted: nobody waits for it.
 
 mod reader;
 mod segment;

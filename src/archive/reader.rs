@@ -1,6 +1,6 @@
 //! Reads an archive, also one that is being written.
 
-use super::segment::{self, EntryHead, Segment, Sum};
+use super::segment::{self, Ending, EntryHead, HEAD_BYTES, Segment, Sum};
 use super::{Entry, Kind};
 use crate::error::{Error, Result};
 use std::path::{Path, PathBuf};
@@ -8,7 +8,7 @@ use std::path::{Path, PathBuf};
 /// An entry as it was found.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct Stored {
-    /// Its number, from 1; numbers never skip.
+    /// Its number, from 1; numbers skip only behind what was damaged.
     pub number: u64,
     /// What was kept; the picture may be left out.
     pub entry: Entry,
@@ -63,19 +63,20 @@ impl Reader {
     /// their pictures. A page takes as long as one segment, however large the archive is.
     pub fn before(&self, before: Option<u64>, limit: usize) -> Result<Vec<Stored>> {
         let before = before.unwrap_or(u64::MAX);
-        let mut found = Vec::new();
+        let (mut found, mut failed) = (Vec::new(), None);
         for (first, path) in self.segments()?.into_iter().rev() {
             if first >= before || found.len() == limit {
                 continue;
             }
-            let read = Self::last_of(&path, before, limit - found.len(), &mut found);
-            // The writer may have taken it away.
-            match read {
-                Err(e) if e.kind() != std::io::ErrorKind::NotFound => return Err(self.failed(&e)),
-                _ => {}
+            // The writer may have taken it away; what cannot be read hides nothing else: `verify` tells.
+            if let Err(e) = Self::last_of(&path, before, limit - found.len(), &mut found) {
+                failed = Some(e).filter(|e| e.kind() != std::io::ErrorKind::NotFound);
             }
         }
-        Ok(found)
+        match failed {
+            Some(e) if found.is_empty() => Err(self.failed(&e)),
+            _ => Ok(found),
+        }
     }
 
     fn last_of(
@@ -87,7 +88,8 @@ impl Reader {
         let Some(mut segment) = Segment::open(path)? else { return Ok(()) };
         let length = std::fs::metadata(path)?.len();
         let mut heads: Vec<(EntryHead, u64)> = Vec::new();
-        while let Some((head, at)) = segment.pass(length)? {
+        // Up to what cannot be read.
+        while let Ok(Some((head, at))) = segment.pass(length) {
             if head.number >= before {
                 break;
             }
@@ -150,9 +152,22 @@ impl Reader {
     ) -> Result<()> {
         let failed = |e: std::io::Error| self.failed(&e);
         let name = path.display();
-        let Some(mut segment) = Segment::open(path).map_err(failed)? else {
-            verdict.broken.push(format!("{name}: its head is damaged"));
-            return Ok(());
+        let length = std::fs::metadata(path).map_err(failed)?.len();
+        let mut segment = match Segment::open(path) {
+            Ok(Some(segment)) => segment,
+            Ok(None) if length <= HEAD_BYTES as u64 => {
+                // Begun when the power went.
+                verdict.torn_bytes += length;
+                return Ok(());
+            }
+            Ok(None) => {
+                verdict.broken.push(format!("{name}: its head is damaged"));
+                return Ok(());
+            }
+            Err(e) => {
+                verdict.broken.push(format!("{name}: cannot be read: {e}"));
+                return Ok(());
+            }
         };
         let (mut sum, mut next) = (segment.head.before, segment.head.first);
         if next != first {
@@ -163,7 +178,16 @@ impl Reader {
         {
             verdict.broken.push(format!("{name}: does not go on from entry {last}"));
         }
-        while let Some((head, entry, [written, comes_out])) = segment.next(&sum).map_err(failed)? {
+        loop {
+            let at = segment.offset;
+            let (head, entry, [written, comes_out]) = match segment.next(&sum) {
+                Ok(Some(found)) => found,
+                Ok(None) => break,
+                Err(e) => {
+                    verdict.broken.push(format!("{name}: cannot be read behind byte {at}: {e}"));
+                    return Ok(());
+                }
+            };
             if head.number != next {
                 let found = head.number;
                 verdict.broken.push(format!("{name}: entry {found} where {next} should be"));
@@ -181,8 +205,18 @@ impl Reader {
             }
             each(Stored { number: head.number, entry })?;
         }
-        let length = std::fs::metadata(path).map_err(failed)?.len();
-        verdict.torn_bytes += length.saturating_sub(segment.offset);
+        // As long as it was at first: it may be written to.
+        let at = segment.offset;
+        match segment.ending(next, length) {
+            Ok(Ending::Whole) => {}
+            Ok(Ending::Torn) => verdict.torn_bytes += length.saturating_sub(at),
+            Ok(Ending::Damaged) => {
+                verdict
+                    .broken
+                    .push(format!("{name}: damaged at byte {at}, where entry {next} should be"));
+            }
+            Err(e) => verdict.broken.push(format!("{name}: cannot be read behind byte {at}: {e}")),
+        }
         Ok(())
     }
 }

@@ -18,6 +18,8 @@ const ENTRY_MAGIC: &[u8; 4] = b"BGEN";
 pub const HEAD_BYTES: usize = 8 + 8 + SUM_BYTES + 4;
 const ENTRY_HEAD_BYTES: usize = 32;
 const SUM_BYTES: usize = 32;
+/// No entry is smaller.
+const ENTRY_BYTES_MIN: u64 = (ENTRY_HEAD_BYTES + SUM_BYTES) as u64;
 /// Text and picture of an entry, each; a claim of more is damage.
 pub const PART_BYTES_MAX: usize = 1 << 20;
 
@@ -131,6 +133,22 @@ pub fn path(folder: &Path, first: u64) -> PathBuf {
     folder.join(format!("{first:020}.{EXTENSION}"))
 }
 
+/// No more entries than this are in so many bytes of a segment, whatever is left of them.
+pub fn entries_max(bytes: u64) -> u64 {
+    bytes.div_ceil(ENTRY_BYTES_MIN)
+}
+
+/// What is behind the last whole entry of a segment.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Ending {
+    /// Nothing.
+    Whole,
+    /// The beginning of an entry, or zeros: a power cut leaves such.
+    Torn,
+    /// Anything else: no power cut does that.
+    Damaged,
+}
+
 /// Reads a segment from its beginning.
 pub struct Segment {
     file: BufReader<File>,
@@ -194,6 +212,37 @@ impl Segment {
         Ok(())
     }
 
+    /// What there is where the next entry, of this number, should be: for when there is none.
+    pub fn ending(&mut self, number: u64, length: u64) -> std::io::Result<Ending> {
+        self.seek(self.offset)?;
+        let left = length.saturating_sub(self.offset);
+        // An entry that is not there as a whole is no longer than this.
+        let entry_max = ENTRY_BYTES_MIN + 2 * PART_BYTES_MAX as u64;
+        let mut bytes = Vec::new();
+        self.file.by_ref().take(left.min(entry_max)).read_to_end(&mut bytes)?;
+        if bytes.is_empty() {
+            return Ok(Ending::Whole);
+        }
+        if is_zero(&bytes) {
+            let mut rest = vec![0; 4096];
+            loop {
+                let n = self.file.read(&mut rest)?;
+                if n == 0 {
+                    return Ok(Ending::Torn);
+                }
+                if !is_zero(&rest[..n]) {
+                    return Ok(Ending::Damaged);
+                }
+            }
+        }
+        let begins = match bytes.first_chunk() {
+            None => bytes.starts_with(&ENTRY_MAGIC[..bytes.len().min(ENTRY_MAGIC.len())]),
+            Some(head) => EntryHead::of(head)
+                .is_some_and(|head| head.number == number && head.entry_bytes() > left),
+        };
+        Ok(if begins && !has_entry(&bytes) { Ending::Torn } else { Ending::Damaged })
+    }
+
     fn head_of_next(&mut self) -> std::io::Result<Option<(EntryHead, [u8; ENTRY_HEAD_BYTES])>> {
         let mut bytes = [0; ENTRY_HEAD_BYTES];
         if !fill(&mut self.file, &mut bytes)? {
@@ -201,6 +250,24 @@ impl Segment {
         }
         Ok(EntryHead::of(&bytes).map(|head| (head, bytes)))
     }
+}
+
+fn is_zero(bytes: &[u8]) -> bool {
+    bytes.iter().all(|&byte| byte == 0)
+}
+
+/// Whether a whole entry begins behind the first bytes: its sum goes on from the 32 bytes before it.
+fn has_entry(bytes: &[u8]) -> bool {
+    let is_entry = |at: usize| {
+        let entry = &bytes[at..];
+        let head = EntryHead::of(entry.first_chunk()?)?;
+        let entry = entry.get(..head.entry_bytes() as usize)?;
+        let (content, written) = entry.split_at(entry.len() - SUM_BYTES);
+        let before = &bytes[at - SUM_BYTES..at];
+        let sum = Sha256::new().chain_update(before).chain_update(content).finalize();
+        (sum.as_slice() == written).then_some(())
+    };
+    (SUM_BYTES..bytes.len()).any(|at| is_entry(at).is_some())
 }
 
 /// Whether there were enough bytes.

@@ -202,6 +202,36 @@ fn what_a_hanging_disk_cost_is_told_in_the_chain_too() {
     assert!((1..=2).contains(&(verdict.entries + lost - 1000)), "{verdict:?}");
 }
 
+static OTHER_DISK_ANSWERS: AtomicBool = AtomicBool::new(false);
+
+fn other_disk_that_hangs(folder: &Path) -> std::io::Result<Space> {
+    while !OTHER_DISK_ANSWERS.load(Ordering::Relaxed) {
+        std::thread::sleep(Duration::from_millis(1));
+    }
+    small_disk(folder)
+}
+
+#[test]
+fn a_disk_that_does_not_answer_is_told_while_it_is_so_before_anything_is_lost() {
+    let folder = folder("silent");
+    let archive = Archive::start_on(&folder, 64 * MIB, other_disk_that_hangs).expect("starts");
+    assert!(!archive.condition().is_bad());
+    archive.put(entry(1, 10));
+    let start = Instant::now();
+    while !archive.condition().is_bad() {
+        assert!(start.elapsed() < PATIENCE, "{:?}", archive.condition());
+        std::thread::sleep(Duration::from_millis(10));
+    }
+    let condition = archive.condition();
+    assert!(condition.lost == 0 && condition.fault.is_some(), "{condition:?}");
+    OTHER_DISK_ANSWERS.store(true, Ordering::Relaxed);
+    while archive.condition().is_bad() {
+        assert!(start.elapsed() < 2 * PATIENCE, "{:?}", archive.condition());
+        std::thread::sleep(Duration::from_millis(10));
+    }
+    archive.finish(PATIENCE);
+}
+
 #[test]
 fn two_processes_do_not_write_one_archive() {
     let folder = folder("two");
@@ -243,4 +273,88 @@ fn it_leaves_room_on_a_disk_that_is_smaller_than_it_may_be() {
     let condition = archive.condition();
     assert!(condition.lost == 1 && condition.fault.is_some(), "{condition:?}");
     archive.finish(PATIENCE);
+}
+
+/// What verifying finds, and the newest entry's number.
+fn verified(folder: &Path) -> (Verdict, u64) {
+    let verdict = Reader::open(folder).expect("there").verify().expect("readable");
+    let last = verdict.last.unwrap_or(0);
+    (verdict, last)
+}
+
+#[test]
+fn damage_in_the_newest_segment_is_no_power_cut_and_no_number_is_given_again() {
+    let folder = folder("damaged");
+    let archive = Archive::start(&folder, 64 * MIB).expect("starts");
+    write(&archive, (1..=5).map(|i| entry(i, 40)));
+    archive.finish(PATIENCE);
+    let path = newest(&folder);
+    let whole = fs::read(&path).expect("there");
+    let entry_bytes = (whole.len() - HEAD_BYTES) / 5;
+    // The segment's head; the head of the first, of a middle and of the last entry; sizes of two.
+    let heads = [0, 2, 4].map(|i| HEAD_BYTES + i * entry_bytes);
+    let places =
+        [3, 10, HEAD_BYTES - 1, heads[0], heads[1], heads[2], heads[0] + 30, heads[1] + 25];
+    for at in places {
+        let _ = fs::remove_dir_all(&folder);
+        fs::create_dir_all(&folder).expect("room");
+        let mut damaged = whole.clone();
+        damaged[at] ^= 1;
+        fs::write(&path, &damaged).expect("room");
+        let (verdict, _) = verified(&folder);
+        assert!(!verdict.broken.is_empty() && verdict.torn_bytes == 0, "byte {at}: {verdict:?}");
+        let archive = Archive::start(&folder, 64 * MIB).expect("starts");
+        write(&archive, std::iter::once(entry(6, 40)));
+        let condition = archive.condition();
+        let name = path.file_name().map(|name| name.to_string_lossy().into_owned());
+        assert!(condition.fault.is_none() && condition.damaged == name, "{condition:?}");
+        archive.finish(PATIENCE);
+        assert_eq!(fs::read(&path).expect("there"), damaged, "left as it was");
+        let (verdict, last) = verified(&folder);
+        assert!(!verdict.broken.is_empty(), "byte {at}: it is still told");
+        assert!(last > 6, "byte {at}: number {last} may be another entry's");
+        let newest = Reader::open(&folder).expect("there").before(None, 2).expect("readable");
+        assert_eq!(newest[0].entry.text, entry(6, 40).text);
+        assert!(newest[1].entry.text.contains("\"damaged\":\"0000"), "{newest:?}");
+    }
+}
+
+#[test]
+fn a_tail_of_zeros_is_what_a_power_cut_leaves() {
+    let folder = folder("zeros");
+    let archive = Archive::start(&folder, 64 * MIB).expect("starts");
+    write(&archive, (1..=3).map(|i| entry(i, 40)));
+    archive.finish(PATIENCE);
+    let path = newest(&folder);
+    let mut bytes = fs::read(&path).expect("there");
+    bytes.resize(bytes.len() + 10_000, 0);
+    fs::write(&path, &bytes).expect("room");
+    let (verdict, _) = verified(&folder);
+    assert!(verdict.broken.is_empty() && verdict.torn_bytes == 10_000, "{verdict:?}");
+    let archive = Archive::start(&folder, 64 * MIB).expect("starts");
+    write(&archive, std::iter::once(entry(4, 40)));
+    assert_eq!(archive.condition().damaged, None);
+    archive.finish(PATIENCE);
+    assert_eq!(verified(&folder).1, 4);
+}
+
+#[test]
+fn what_cannot_be_read_is_passed_over_and_told() {
+    let folder = folder("unreadable");
+    let archive = Archive::start(&folder, 64 * MIB).expect("starts");
+    write(&archive, (1..=3).map(|i| entry(i, 40)));
+    archive.finish(PATIENCE);
+    // A folder opens and cannot be read, as a file on a bad sector.
+    fs::create_dir(folder.join(format!("{:020}.bga", 4))).expect("room");
+    let archive = Archive::start(&folder, 64 * MIB).expect("starts");
+    write(&archive, std::iter::once(entry(6, 40)));
+    let condition = archive.condition();
+    assert!(condition.written == 1 && condition.fault.is_none(), "{condition:?}");
+    assert!(condition.damaged.is_some(), "{condition:?}");
+    archive.finish(PATIENCE);
+    let (verdict, last) = verified(&folder);
+    assert!(verdict.entries == 5 && last > 5 && !verdict.broken.is_empty(), "{verdict:?}");
+    let found =
+        Reader::open(&folder).expect("there").before(None, 9).expect("the rest is readable");
+    assert_eq!(found.len(), 5);
 }

@@ -1,6 +1,6 @@
 //! The archive's writer: a thread of its own behind a bounded ring.
 
-use super::segment::{self, HEAD_BYTES, Head, PART_BYTES_MAX, Segment, Sum};
+use super::segment::{self, Ending, HEAD_BYTES, Head, PART_BYTES_MAX, Segment, Sum, entries_max};
 use super::{Entry, Kind};
 use crate::error::{Error, Result};
 use std::fs::{self, File, OpenOptions};
@@ -8,13 +8,15 @@ use std::io::{self, ErrorKind, Write};
 use std::path::{Path, PathBuf};
 use std::sync::atomic::{AtomicU64, Ordering};
 use std::sync::mpsc::{Receiver, RecvTimeoutError, SyncSender, sync_channel};
-use std::sync::{Arc, Mutex, PoisonError};
+use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 use std::time::{Duration, Instant};
 
 /// Entries that wait for the disk.
 const RING: usize = 64;
 /// What was written reaches the disk within this.
 const SYNC_PERIOD: Duration = Duration::from_secs(1);
+/// A disk that takes longer than this for an entry hangs.
+const HANGS: Duration = Duration::from_secs(3);
 /// A disk that failed is tried again after this.
 const RETRY: Duration = Duration::from_secs(2);
 /// A segment has at most this share of the archive, and at most so many bytes: it goes as a whole.
@@ -39,6 +41,15 @@ pub struct Condition {
     pub bytes_max: u64,
     /// Why it cannot be written at present.
     pub fault: Option<String>,
+    /// What was found damaged since start: the chain goes on behind it.
+    pub damaged: Option<String>,
+}
+
+impl Condition {
+    /// Whether somebody should look after it.
+    pub fn is_bad(&self) -> bool {
+        self.lost > 0 || self.fault.is_some() || self.damaged.is_some()
+    }
 }
 
 /// A disk's size and what is free on it, bytes.
@@ -69,6 +80,19 @@ struct Shared {
     lost: AtomicU64,
     bytes: AtomicU64,
     fault: Mutex<Option<String>>,
+    damaged: Mutex<Option<String>>,
+    /// Since when the writer waits for the disk.
+    waits: Mutex<Option<Instant>>,
+}
+
+impl Shared {
+    fn hangs(&self) -> bool {
+        lock(&self.waits).is_some_and(|since| since.elapsed() > HANGS)
+    }
+}
+
+fn lock<T>(mutex: &Mutex<T>) -> MutexGuard<'_, T> {
+    mutex.lock().unwrap_or_else(PoisonError::into_inner)
 }
 
 /// The archive, being written.
@@ -130,7 +154,12 @@ impl Archive {
             lost: count(&self.shared.lost),
             bytes: count(&self.shared.bytes),
             bytes_max: self.bytes_max,
-            fault: self.shared.fault.lock().unwrap_or_else(PoisonError::into_inner).clone(),
+            fault: if self.shared.hangs() {
+                Some("the disk does not answer".to_owned())
+            } else {
+                lock(&self.shared.fault).clone()
+            },
+            damaged: lock(&self.shared.damaged).clone(),
         }
     }
 
@@ -166,6 +195,8 @@ struct Open {
     next: u64,
     sum: Sum,
     unsynced: Option<Instant>,
+    /// What was found damaged, and is not told in the chain yet.
+    damaged: Option<String>,
 }
 
 impl Writer {
@@ -176,13 +207,16 @@ impl Writer {
                 .as_ref()
                 .and_then(|open| open.unsynced)
                 .map_or(RETRY, |since| SYNC_PERIOD.saturating_sub(since.elapsed()));
-            match entries.recv_timeout(wait) {
+            let received = entries.recv_timeout(wait);
+            *lock(&self.shared.waits) = Some(Instant::now());
+            match received {
                 Ok(entry) => self.take(&entry),
                 Err(RecvTimeoutError::Timeout) => self.idle(),
                 Err(RecvTimeoutError::Disconnected) => break,
             }
             // Also when entries come without a pause.
             self.sync(SYNC_PERIOD);
+            *lock(&self.shared.waits) = None;
         }
         self.tell_lost();
         self.sync(Duration::ZERO);
@@ -233,7 +267,7 @@ impl Writer {
         self.retry_at = Some(Instant::now() + RETRY);
         // What is on the disk is found out anew.
         self.open = None;
-        let mut fault = self.shared.fault.lock().unwrap_or_else(PoisonError::into_inner);
+        let mut fault = lock(&self.shared.fault);
         let text = error.to_string();
         if fault.as_deref() != Some(&text) {
             tracing::error!(folder = %self.folder.display(), %error, "the archive cannot be written");
@@ -243,7 +277,7 @@ impl Writer {
 
     fn heal(&mut self) {
         self.retry_at = None;
-        let mut fault = self.shared.fault.lock().unwrap_or_else(PoisonError::into_inner);
+        let mut fault = lock(&self.shared.fault);
         if fault.take().is_some() {
             tracing::info!(folder = %self.folder.display(), "the archive is written again");
         }
@@ -254,6 +288,9 @@ impl Writer {
             Some(open) => open,
             None => Open::new(&self.folder)?,
         };
+        if open.damaged.is_some() {
+            lock(&self.shared.damaged).clone_from(&open.damaged);
+        }
         self.shared.bytes.store(open.bytes(), Ordering::Relaxed);
         Ok(self.open.insert(open))
     }
@@ -266,17 +303,20 @@ impl Writer {
         self.append(entry)
     }
 
-    /// Tell in the chain what was lost, on the way to the disk and before it, and not told yet.
+    /// Tell in the chain what was lost, on the way to the disk and before it, or damaged on it, and not
+    /// told yet.
     fn write_gap(&mut self) -> io::Result<()> {
         let lost = self.shared.lost.load(Ordering::Relaxed);
         let untold = lost - self.told;
-        if untold == 0 {
+        let damaged = self.opened()?.damaged.clone();
+        if untold == 0 && damaged.is_none() {
             return Ok(());
         }
-        let text = format!("{{\"lost\":{untold}}}");
+        let text = serde_json::json!({ "lost": untold, "damaged": damaged }).to_string();
         let (kind, utc_ms) = (Kind::Gap, self.newest_ms);
         self.append(&Entry { kind, utc_ms, text, picture: Vec::new() })?;
         self.told = lost;
+        self.opened()?.damaged = None;
         Ok(())
     }
 
@@ -317,8 +357,11 @@ impl Open {
         for (first, path) in &listed {
             segments.push((*first, size(path)?));
         }
-        let (file, next, sum) = take_up(&listed, &mut segments)?;
-        Ok(Self { _lock: lock, segments, file, next, sum, unsynced: None })
+        let TakenUp { file, next, sum, damaged } = take_up(&listed, &mut segments)?;
+        let name =
+            |path: &PathBuf| path.file_name().map(|name| name.to_string_lossy().into_owned());
+        let damaged = damaged.as_ref().and_then(name);
+        Ok(Self { _lock: lock, segments, file, next, sum, unsynced: None, damaged })
     }
 
     fn bytes(&self) -> u64 {
@@ -401,42 +444,97 @@ impl Open {
     }
 }
 
-/// Where the chain goes on: the newest segment if it is whole, else a new one. Segments without a whole
-/// head, begun when the power went, are removed.
-fn take_up(
-    listed: &[(u64, PathBuf)],
-    segments: &mut Vec<(u64, u64)>,
-) -> io::Result<(Option<File>, u64, Sum)> {
-    for (first, path) in listed.iter().rev() {
-        let Some(mut newest) = Segment::open(path)? else {
-            let length = fs::metadata(path)?.len();
-            let damaged = length > HEAD_BYTES as u64;
-            tracing::warn!(path = %path.display(), damaged, "a segment of the archive has no head");
-            if damaged {
-                fs::rename(path, path.with_extension("damaged"))?;
-            } else {
-                fs::remove_file(path)?;
-            }
-            segments.retain(|(known, _)| known != first);
-            continue;
-        };
-        let (mut sum, mut next, mut whole) =
-            (newest.head.before, newest.head.first, HEAD_BYTES as u64);
-        while let Some((head, _, [written, comes_out])) = newest.next(&sum)? {
-            if written != comes_out || head.number != next {
-                break;
-            }
-            (sum, next, whole) = (written, next + 1, newest.offset);
-        }
-        let length = fs::metadata(path)?.len();
-        let file =
-            (whole == length).then(|| OpenOptions::new().append(true).open(path)).transpose()?;
-        if file.is_none() && next == *first {
-            // A segment of that name would begin with the same entry.
-            fs::rename(path, path.with_extension("damaged"))?;
-            segments.retain(|(known, _)| known != first);
-        }
-        return Ok((file, next, sum));
+/// Where the chain goes on.
+struct TakenUp {
+    /// The newest segment, if it can be gone on with.
+    file: Option<File>,
+    next: u64,
+    sum: Sum,
+    damaged: Option<PathBuf>,
+}
+
+/// How far a segment is whole.
+enum Look {
+    /// Begun when the power went: nothing was in it.
+    Empty,
+    /// Up to the number that comes next, with the sum up to there.
+    Whole { next: u64, sum: Sum, bytes: u64, ending: Ending },
+    /// Not even its head.
+    Damaged,
+}
+
+fn look(first: u64, path: &Path, length: u64) -> io::Result<Look> {
+    let Some(mut segment) = Segment::open(path)? else {
+        // The head reaches the disk before any entry does.
+        return Ok(if length > HEAD_BYTES as u64 { Look::Damaged } else { Look::Empty });
+    };
+    if segment.head.first != first {
+        return Ok(Look::Damaged);
     }
-    Ok((None, 1, Sum::default()))
+    let (mut sum, mut next, mut bytes) = (segment.head.before, first, HEAD_BYTES as u64);
+    let ending = loop {
+        match segment.next(&sum) {
+            Ok(Some((head, _, [written, comes_out]))) => {
+                if written != comes_out || head.number != next {
+                    break Ending::Damaged;
+                }
+                (sum, next, bytes) = (written, next + 1, segment.offset);
+            }
+            Ok(None) => break segment.ending(next, length).unwrap_or(Ending::Damaged),
+            // A sector that cannot be read.
+            Err(_) => break Ending::Damaged,
+        }
+    };
+    Ok(Look::Whole { next, sum, bytes, ending })
+}
+
+/// The chain goes on in the newest segment if that is whole, else in a new one. What is damaged stays as
+/// it is, to be found by whoever verifies, and no number that may be in it is given again.
+fn take_up(listed: &[(u64, PathBuf)], segments: &mut Vec<(u64, u64)>) -> io::Result<TakenUp> {
+    let mut damaged: Option<PathBuf> = None;
+    let mut next_min = 1;
+    for (first, path) in listed.iter().rev() {
+        let length = fs::metadata(path)?.len();
+        let looked = look(*first, path, length).unwrap_or_else(|error| {
+            tracing::error!(path = %path.display(), %error, "a segment of the archive cannot be read");
+            Look::Damaged
+        });
+        let is_damaged =
+            matches!(looked, Look::Damaged | Look::Whole { ending: Ending::Damaged, .. });
+        if is_damaged {
+            tracing::error!(path = %path.display(), "a segment of the archive is damaged");
+            damaged.get_or_insert_with(|| path.clone());
+        }
+        match looked {
+            Look::Empty => {
+                tracing::warn!(path = %path.display(), "a segment of the archive was just begun");
+                fs::remove_file(path)?;
+                segments.retain(|(known, _)| known != first);
+            }
+            Look::Damaged => {
+                next_min = next_min.max(first.saturating_add(1 + entries_max(length)));
+            }
+            Look::Whole { next, sum, bytes, ending } => {
+                if ending == Ending::Damaged {
+                    let lost = 1 + entries_max(length.saturating_sub(bytes));
+                    next_min = next_min.max(next.saturating_add(lost));
+                }
+                let is_newest = damaged.is_none();
+                // A segment of its name would begin with the same entry.
+                let is_torn_off = ending == Ending::Torn && next == *first && is_newest;
+                let mut file = None;
+                if is_newest && (ending == Ending::Whole || is_torn_off) {
+                    let opened = OpenOptions::new().append(true).open(path)?;
+                    opened.set_len(bytes)?;
+                    segments
+                        .iter_mut()
+                        .filter(|(known, _)| known == first)
+                        .for_each(|s| s.1 = bytes);
+                    file = Some(opened);
+                }
+                return Ok(TakenUp { file, next: next.max(next_min), sum, damaged });
+            }
+        }
+    }
+    Ok(TakenUp { file: None, next: next_min, sum: Sum::default(), damaged })
 }

@@ -16,6 +16,8 @@ pub struct Web {
     pub address: IpAddr,
     /// Its port.
     pub port: u16,
+    /// Only these addresses may see it; none given: all.
+    pub allow: Vec<IpAddr>,
     /// Names that browsers may call this machine by, besides its own, `localhost` and any address.
     pub hosts: Vec<String>,
     /// Connections at once; a browser opens up to six.
@@ -30,6 +32,7 @@ impl Default for Web {
             enabled: true,
             address: IpAddr::V4(Ipv4Addr::UNSPECIFIED),
             port: 8080,
+            allow: Vec::new(),
             hosts: Vec::new(),
             connections_max: 64,
             pictures_per_s_max: 10,
@@ -57,6 +60,12 @@ impl Default for Archive {
 const HOST_CHARACTERS_MAX: usize = 253;
 
 impl Web {
+    /// Whether a visitor may see the page. An IPv4 visitor of an IPv6 socket is the same visitor.
+    pub fn admits(&self, visitor: IpAddr) -> bool {
+        let is = |a: &IpAddr| a.to_canonical() == visitor.to_canonical();
+        self.allow.is_empty() || self.allow.iter().any(is)
+    }
+
     pub(super) fn check(&self) -> Result<()> {
         let is_name = |host: &&String| {
             (1..=HOST_CHARACTERS_MAX).contains(&host.len())

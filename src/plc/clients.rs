@@ -70,7 +70,7 @@ pub struct Client {
     pub may_write: bool,
 }
 
-/// The list of connected clients, to be looked at from elsewhere.
+/// The list of connected clients; locked by the PLC thread's tasks alone, so that they wait for nobody.
 #[derive(Clone, Debug)]
 pub struct ClientList(Arc<Mutex<Clients>>);
 
@@ -84,8 +84,8 @@ impl ClientList {
         self.0.lock().unwrap_or_else(PoisonError::into_inner)
     }
 
-    /// Those that are connected.
-    pub fn connected(&self) -> Vec<Client> {
+    /// Put those that are connected into a list; it never needs more than `Self::room`.
+    pub fn copy_to(&self, list: &mut Vec<Client>) {
         let now_ms = now_ms();
         let clients = self.lock();
         let alive = clients.connected.iter().filter(|(_, connection)| !connection.is_finished());
@@ -98,7 +98,13 @@ impl ClientList {
                 may_write: asked.may_write,
             })
         };
-        alive.filter_map(|(asked, _)| client(asked)).collect()
+        list.clear();
+        list.extend(alive.filter_map(|(asked, _)| client(asked)));
+    }
+
+    /// No more are connected at once.
+    pub fn room(&self) -> usize {
+        self.lock().max + STRANGERS_MAX
     }
 }
 

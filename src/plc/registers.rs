@@ -71,6 +71,8 @@ pub struct VisionStatus {
     pub frames_torn: u64,
     /// Lately too many of them, whichever of the three.
     pub frames_missing: bool,
+    /// The archive has lost entries, is damaged, or its disk fails or does not answer.
+    pub archive_fails: bool,
     /// There is no camera, or it does not do what the configuration asks for.
     pub camera_absent: bool,
     /// How often the camera was lost.
@@ -176,7 +178,7 @@ pub struct Status {
 }
 
 /// What is wrong or worth knowing: code and meaning.
-pub const REASONS: [(u16, &str); 20] = [
+pub const REASONS: [(u16, &str); 21] = [
     (0, "all is well"),
     (1, "the frame source has ended or failed"),
     (2, "no frames arrive"),
@@ -205,6 +207,10 @@ pub const REASONS: [(u16, &str); 20] = [
     (
         19,
         "of the frames of the last 10 s more than 1 in 100 are missing: see frames_dropped, frames_lost, frames_torn",
+    ),
+    (
+        20,
+        "the archive: its disk fails or does not answer, entries were lost, or damage was found, since start; see the page",
     ),
 ];
 
@@ -252,6 +258,7 @@ impl Status {
             self.vision.belt.not_as_configured,
             self.vision.belt.hides_parcels,
             self.vision.frames_missing,
+            self.vision.archive_fails,
         ])
     }
 
@@ -280,6 +287,7 @@ impl Status {
             (19, self.vision.frames_missing),
             (9, self.stopped),
             (13, self.vision.import.result == IMPORT_REFUSED),
+            (20, self.vision.archive_fails),
             (10, self.queue_overflows > 0),
             (11, self.overflows() > 0),
         ];
@@ -326,7 +334,7 @@ pub const STATUS_FIELDS: &[StatusField] = fields![
     [4, V1_0, "test_i16", I16, "", 1.0, "constant -12345: checks the sign", |_| -12345.0],
     [10, V1_0, "heartbeat", U16, "", 1.0, "rises ten times a second while frames arrive; wraps", |s| f64::from(s.heartbeat)],
     [11, V1_0, "status", U16, "bits", 1.0, "bit 0 running, bit 1 ready (belt learned), bit 2 belt motion measured, bit 3 by the encoder, bit 4 stopped by command, bit 5 PLC silent, bit 6 parcels wait to be acknowledged", |s| f64::from(s.status_bits())],
-    [12, V1_0, "fault", U16, "bits", 1.0, "bit 0 frame source ended, bit 1 a table has been full since start (see counters), bit 2 a parcel was never acknowledged, bit 3 CAN bus off or down, bit 4 encoder silent, bit 5 no camera, bit 6 the disk fails, bit 7 encoder and belt disagree, bit 8 the belt does not run as configured, bit 9 the belt hides parcels, bit 10 frames are missing", |s| f64::from(s.fault_bits())],
+    [12, V1_0, "fault", U16, "bits", 1.0, "bit 0 frame source ended, bit 1 a table has been full since start (see counters), bit 2 a parcel was never acknowledged, bit 3 CAN bus off or down, bit 4 encoder silent, bit 5 no camera, bit 6 the disk fails, bit 7 encoder and belt disagree, bit 8 the belt does not run as configured, bit 9 the belt hides parcels, bit 10 frames are missing, bit 11 the archive fails", |s| f64::from(s.fault_bits())],
     [13, V1_0, "belt_speed", U32, "mm/s", 10.0, "belt speed", |s| s.vision.belt_speed_mm_per_s],
     [15, V1_0, "frames", U32, "", 1.0, "frames processed; wraps", |s| wrapped(s.vision.counters.frames)],
     [17, V1_0, "frames_dropped", U32, "", 1.0, "frames that came too late; wraps", |s| wrapped(s.vision.frames_dropped)],
@@ -544,7 +552,7 @@ mod tests {
         assert_eq!(status.reason(), 3);
         assert!(status.reasons().eq([3, 6, 11]));
         let codes = REASONS.iter().map(|(code, _)| *code);
-        assert!(codes.eq(0..20));
+        assert!(codes.eq(0..21));
     }
 
     #[test]

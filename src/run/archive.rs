@@ -56,6 +56,13 @@ fn line(stored: &Stored) -> String {
             )
         }
         Kind::Event => format!("{} {} {}", word("kind"), what["code"], word("detail")),
+        Kind::Gap if !what["damaged"].is_null() => {
+            let lost = &what["lost"];
+            format!(
+                "{} is damaged: entries in it are missing; {lost} more were lost",
+                word("damaged")
+            )
+        }
         Kind::Gap => format!("{} entries were lost: the disk did not take them", what["lost"]),
     }
 }

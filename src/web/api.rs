@@ -5,6 +5,7 @@ use super::board::{Board, PARCELS_MAX, View};
 use super::guard::{self, Hosts};
 use super::metrics;
 use super::model::{Archived, Event, Machine, Parcel};
+use crate::config::Web as Settings;
 use crate::event::csv;
 use axum::extract::{Path, RawQuery, Request, State};
 use axum::http::{Method, StatusCode, header};
@@ -17,29 +18,33 @@ use std::sync::Arc;
 use std::time::Duration;
 use tokio::sync::Semaphore;
 
-/// A request for a live picture waits this long for one.
+/// A request for a live picture waits this long for one that is due.
 const PICTURE_PATIENCE: Duration = Duration::from_secs(1);
 /// Entries of the archive in one answer.
 const ARCHIVED_MAX: usize = 100;
 /// A number in a query has no more digits.
 const DIGITS_MAX: usize = 20;
 
+/// How long a request waits for a live picture: the next one may not be made before its time.
+fn patience(settings: &Settings) -> Duration {
+    PICTURE_PATIENCE + Duration::from_secs(1) / settings.pictures_per_s_max.max(1)
+}
+
 /// What the answers are made from.
 #[derive(Clone)]
 struct Sources {
+    patience: Duration,
     board: Arc<Board>,
     machine: Arc<dyn Machine>,
     questions: Arc<Semaphore>,
 }
 
-/// All that is served; so many questions at most may wait for the disk.
-pub(super) fn router(
-    board: Arc<Board>,
-    machine: Arc<dyn Machine>,
-    hosts: Hosts,
-    questions_max: usize,
-) -> Router {
-    let questions = Arc::new(Semaphore::new(questions_max));
+/// All that is served; so many questions at most may wait for the disk as there are visitors.
+pub(super) fn router(board: Arc<Board>, machine: Arc<dyn Machine>, settings: &Settings) -> Router {
+    let hosts = Hosts::new(settings);
+    // A visitor asks one question at a time.
+    let questions = Arc::new(Semaphore::new(settings.connections_max));
+    let patience = patience(settings);
     let mut router = Router::new();
     for (path, kind, bytes) in ASSETS {
         let asset = move || async move { ([(header::CONTENT_TYPE, *kind)], *bytes) };
@@ -58,7 +63,17 @@ pub(super) fn router(
         .route("/metrics", get(metrics))
         .fallback(|| async { refusal(StatusCode::NOT_FOUND, "there is no such page") })
         .layer(middleware::from_fn_with_state(hosts, admit))
-        .with_state(Sources { board, machine, questions })
+        .with_state(Sources { patience, board, machine, questions })
+}
+
+/// For visitors whom `web.allow` does not name: nothing but why.
+pub(super) fn closed() -> Router {
+    let text = "this address may not see the page: put it into web.allow";
+    let protected = |mut answer: Response| {
+        guard::protect(answer.headers_mut());
+        answer
+    };
+    Router::new().fallback(move || async move { protected(refusal(StatusCode::FORBIDDEN, text)) })
 }
 
 /// An answer that says what was wrong.
@@ -199,7 +214,7 @@ async fn live(
     };
     let shown = number(query.as_deref(), "after")?;
     let next = from.board.next_picture(view, shown);
-    Ok(match tokio::time::timeout(PICTURE_PATIENCE, next).await {
+    Ok(match tokio::time::timeout(from.patience, next).await {
         Ok(picture) => {
             let kind = [(header::CONTENT_TYPE, "application/octet-stream")];
             (kind, picture.bytes.clone()).into_response()
@@ -246,4 +261,19 @@ async fn archive_picture(
 ) -> Result<Response, Response> {
     let Ok(entry) = entry.parse() else { return Ok(jpeg(None::<Vec<u8>>)) };
     Ok(jpeg(read(&from, move |machine| machine.archived_picture(entry)).await?))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_request_outwaits_the_pause_between_pictures_at_every_rate() {
+        for pictures_per_s_max in 1..=60 {
+            let settings = Settings { pictures_per_s_max, ..Settings::default() };
+            let pause = Duration::from_secs(1) / pictures_per_s_max;
+            // Beside the pause: some frames of a slow camera, and the desk's look.
+            assert!(patience(&settings) >= pause + Duration::from_secs(1), "{pictures_per_s_max}");
+        }
+    }
 }

@@ -20,6 +20,6 @@ mod server;
 pub use board::{Board, Picture, View};
 pub use model::{
     ArchiveState, Archived, BeltState, CameraState, Client, Counts, Cuboid, Event, Field, Lamp,
-    Machine, Parcel, ParcelPicture, Plc, Scene, Sight, State, Written,
+    Machine, NoPicture, Parcel, ParcelPicture, Plc, Scene, Sight, State, Written,
 };
 pub use server::{Listening, listen, serve};

@@ -27,7 +27,7 @@ pub trait Machine: Send + Sync + 'static {
 pub struct State {
     /// Version of the program.
     pub version: &'static str,
-    /// The machine's clock, ms since 1970.
+    /// The machine's clock when this was so, ms since 1970: it stands still when nothing new is known.
     pub utc_ms: u64,
     /// Since start.
     pub uptime_s: f64,
@@ -121,6 +121,8 @@ pub struct Counts {
     pub pictures_missed: u64,
     /// Parcels that page and archive were not told of, because too many came at once.
     pub parcels_missed: u64,
+    /// Commands that are no events, because too many came at once.
+    pub commands_missed: u64,
     /// Lines of the log that nobody read.
     pub log_lines_dropped: u64,
 }
@@ -140,6 +142,8 @@ pub struct ArchiveState {
     pub bytes_max: u64,
     /// Why it cannot be written at present.
     pub fault: Option<String>,
+    /// The part of it that was found damaged since start.
+    pub damaged: Option<String>,
 }
 
 /// A parcel as it was told to the PLC.
@@ -154,6 +158,23 @@ pub struct Parcel {
     pub record: ParcelRecord,
     /// Its picture, if there is one.
     pub picture: Option<ParcelPicture>,
+    /// Why there is none.
+    pub no_picture: Option<NoPicture>,
+}
+
+/// Why there is no picture of a parcel.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize)]
+#[serde(rename_all = "snake_case")]
+pub enum NoPicture {
+    /// Too many came at once.
+    TooMany,
+    /// It was not followed through the middle of the zone, where pictures are taken.
+    NotInMiddle,
+}
+
+impl NoPicture {
+    /// All of them.
+    pub const ALL: [Self; 2] = [Self::TooMany, Self::NotInMiddle];
 }
 
 /// What belongs to a parcel's picture.

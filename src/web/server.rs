@@ -2,7 +2,7 @@
 
 use super::api;
 use super::board::Board;
-use super::guard::{Doorkeeper, Hosts, Visit};
+use super::guard::{Doorkeeper, Visit};
 use super::model::Machine;
 use crate::config::Web as Settings;
 use crate::error::{Error, Result};
@@ -108,15 +108,15 @@ async fn accept(
 ) {
     let listener = patiently(settings, listening).await;
     let door = Doorkeeper::new(settings.connections_max);
-    // A visitor asks one question at a time.
-    let questions_max = settings.connections_max;
-    let router = api::router(Arc::clone(board), machine, Hosts::new(settings), questions_max);
+    let router = api::router(Arc::clone(board), machine, settings);
     loop {
         match listener.accept().await {
             Ok((stream, address)) => {
                 // One too many is hung up on.
                 if let Some(visit) = door.admit(address.ip()) {
-                    tokio::spawn(receive(stream, visit, router.clone()));
+                    let admitted = settings.admits(address.ip());
+                    let router = if admitted { router.clone() } else { api::closed() };
+                    tokio::spawn(receive(stream, visit, router));
                 }
             }
             Err(_) => tokio::time::sleep(ACCEPT_RETRY).await,

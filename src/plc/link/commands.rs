@@ -132,13 +132,15 @@ impl Link {
             if ticket == 0 { (Outcome::None, None) } else { self.decide(command, argument) };
         if ticket != 0 {
             tracing::info!(%sender, ticket, command, argument, ?outcome, "command");
-            self.commanded = Some(Commanded { sender, ticket, command, argument });
         }
         let noted = self.journal.change(|state| {
             (state.ticket, state.outcome) = (ticket, outcome as u16);
             (state.command, state.argument) = (command, argument);
         });
-        let decided = Decided { noted, ticket, outcome, request };
+        let told = outcome as u16;
+        let given = Commanded { sender, ticket, command, argument, outcome: told };
+        let given = (ticket != 0).then_some(given);
+        let decided = Decided { noted, ticket, outcome, request, given };
         let _ = self.decided.push_back(decided); // invariant: there is room
         self.journal.save();
         self.publish_kept();

@@ -30,6 +30,8 @@ pub(super) const REPEATED: usize = 12;
 const COUNTS_MAX: usize = 64;
 /// Commands between two visits of the vision thread.
 const REQUESTS_MAX: usize = 8;
+/// Commands between two visits of those who watch.
+const COMMANDED_MAX: usize = 64;
 /// Without a frame for this long the heartbeat stops.
 const SILENCE: Duration = Duration::from_secs(1);
 /// The state between vision and PLC.
@@ -58,7 +60,10 @@ pub struct Link {
     published: Deque<ParcelRecord, WAITING_MAX>,
     /// Who wrote registers last, and when.
     written: Option<(Sender, Instant)>,
-    commanded: Option<Commanded>,
+    /// Carried out or refused, and not yet told to those who watch.
+    commanded: Deque<Commanded, COMMANDED_MAX>,
+    /// Commands that found `commanded` full.
+    commands_untold: u64,
     /// Parcels that found `waiting` full.
     unpublished: u64,
     counts: Deque<(u32, Instant), COUNTS_MAX>,
@@ -72,7 +77,7 @@ pub struct Link {
     beats: Beats,
 }
 
-/// The last command, as it was given.
+/// A command as it was given, and what became of it.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct Commanded {
     /// By whom.
@@ -83,6 +88,8 @@ pub struct Commanded {
     pub command: u16,
     /// Its argument.
     pub argument: u32,
+    /// See [`Outcome`].
+    pub outcome: u16,
 }
 
 /// A command that was decided on, and is carried out and told when the disk has it.
@@ -91,6 +98,8 @@ struct Decided {
     ticket: u16,
     outcome: Outcome,
     request: Option<Request>,
+    /// For those who watch; none: ticket 0 is no command.
+    given: Option<Commanded>,
 }
 
 /// Rises ten times a second while frames arrive.
@@ -137,7 +146,8 @@ impl Link {
             unsent: 0,
             published: Deque::new(),
             written: None,
-            commanded: None,
+            commanded: Deque::new(),
+            commands_untold: 0,
             unpublished: 0,
             counts: Deque::new(),
             requests: Deque::new(),
@@ -349,6 +359,9 @@ impl Link {
             let _ = self.requests.push_back(request); // invariant: room was asked for
         }
         (self.status.ticket, self.status.outcome) = (decided.ticket, decided.outcome as u16);
+        if let Some(given) = decided.given {
+            self.commands_untold += u64::from(self.commanded.push_back(given).is_err());
+        }
         self.show_settings();
     }
 
@@ -422,9 +435,14 @@ impl Link {
         self.published.pop_front()
     }
 
-    /// The last command of this run.
-    pub fn commanded(&self) -> Option<Commanded> {
-        self.commanded
+    /// The next command that was carried out or refused.
+    pub fn next_commanded(&mut self) -> Option<Commanded> {
+        self.commanded.pop_front()
+    }
+
+    /// Commands that nobody was told of, because too many came at once.
+    pub fn commands_untold(&self) -> u64 {
+        self.commands_untold
     }
 
     /// Who wrote registers last, and when.

@@ -115,6 +115,28 @@ fn a_parcel_is_published_when_the_belt_has_carried_it_on() {
 }
 
 #[test]
+fn every_command_is_told_with_its_outcome_and_too_many_are_counted() {
+    let mut link = link(Settings::default());
+    let give = |link: &mut Link, ticket: u16, command: u16| {
+        let registers = [ticket, command, 0, 50];
+        link.write(COMMAND + 4, &registers, SENDER, Instant::now()).expect("inside");
+    };
+    // All between two visits of those who watch.
+    for (ticket, command) in [(7, 5), (8, 99), (8, 99), (0, 0), (9, 5)] {
+        give(&mut link, ticket, command);
+    }
+    let told = std::iter::from_fn(|| link.next_commanded());
+    let told: Vec<_> = told.map(|c| (c.ticket, c.command, c.outcome)).collect();
+    let (done, unknown) = (Outcome::Done as u16, Outcome::Unknown as u16);
+    assert_eq!(told, [(7, 5, done), (8, 99, unknown), (9, 5, done)]);
+    for ticket in 10..110 {
+        give(&mut link, ticket, 5);
+    }
+    assert_eq!(std::iter::from_fn(|| link.next_commanded()).count(), COMMANDED_MAX);
+    assert_eq!(link.commands_untold(), 100 - COMMANDED_MAX as u64);
+}
+
+#[test]
 fn a_command_is_carried_out_once_for_each_ticket() {
     let mut link = link(Settings::default());
     let mut command = |ticket: u16, command: u16, argument: u16| {
@@ -359,7 +381,13 @@ fn a_sender_that_finds_the_disk_hanging_is_told_so_of_its_own_ticket() {
     let mut link = link(Settings::default());
     let (ticket, outcome) = (6, Outcome::Done);
     while !link.decided.is_full() {
-        let _ = link.decided.push_back(Decided { noted: 0, ticket, outcome, request: None });
+        let _ = link.decided.push_back(Decided {
+            noted: 0,
+            ticket,
+            outcome,
+            request: None,
+            given: None,
+        });
     }
     let answer = link.command(77, 3, 0, SENDER);
     assert_eq!((answer.ticket, answer.outcome), (77, Outcome::Busy as u16));

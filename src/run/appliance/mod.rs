@@ -19,13 +19,14 @@ use super::memory::Carved;
 use super::realtime;
 use super::watchdog::{Beats, Watchdog};
 use crate::belt::Encoder;
-use crate::config::Site;
+use crate::config::{Config, Site};
 use crate::error::{Error, Result};
 use crate::event::ParcelRecord;
 use crate::plan::Block;
 use crate::plc::clients::ClientList;
 use crate::plc::command::Request;
 use crate::plc::journal::Journal;
+use crate::plc::link::Commanded;
 use crate::plc::modbus;
 use crate::plc::registers::{ImportStatus, VisionStatus};
 use crate::source::{Feed, FeedStatus, Taken};
@@ -34,7 +35,7 @@ use capture::Capture;
 use heapless::spsc::Queue;
 use plc::PlcThread;
 use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
-use std::sync::{Arc, Mutex, OnceLock};
+use std::sync::{Arc, Mutex, OnceLock, TryLockError};
 use std::time::{Duration, Instant};
 use vision::Vision;
 
@@ -48,6 +49,8 @@ const SERVICE_STACK_BYTES: usize = 512 * 1024;
 const COUNT_RING: usize = 128;
 /// Requests on their way to vision, and one.
 const REQUEST_RING: usize = 16;
+/// Commands on their way to the desk, and one.
+const COMMAND_RING: usize = 64;
 /// How long a thread sleeps when a ring is empty and nobody has woken it.
 const PARK: Duration = Duration::from_millis(50);
 /// The ends of the threads are looked for this often.
@@ -108,6 +111,23 @@ struct Shared {
     progress: Mutex<Progress>,
 }
 
+/// What is behind the locks, as it was known last.
+#[derive(Clone, Copy, Debug, Default)]
+struct Known {
+    progress: Progress,
+    feed: FeedStatus,
+    import: ImportStatus,
+}
+
+/// Look at what is behind a lock, unless somebody holds it.
+fn renew<T: Copy>(known: &mut T, mutex: &Mutex<T>) {
+    match mutex.try_lock() {
+        Ok(now) => *known = *now,
+        Err(TryLockError::Poisoned(now)) => *known = *now.into_inner(),
+        Err(TryLockError::WouldBlock) => {}
+    }
+}
+
 /// The contents of a lock, whatever happened to who held it.
 fn lock<T: Copy>(mutex: &Mutex<T>) -> T {
     *mutex.lock().unwrap_or_else(std::sync::PoisonError::into_inner)
@@ -135,8 +155,20 @@ impl Shared {
         self.stop.load(Ordering::Relaxed)
     }
 
+    /// For a thread that may wait.
     fn progress(&self) -> Progress {
-        let (mut progress, feed) = (lock(&self.progress), lock(&self.feed));
+        let (progress, feed) = (lock(&self.progress), lock(&self.feed));
+        self.together(Known { progress, feed, import: lock(&self.imports) })
+    }
+
+    /// For a thread that waits for nobody: what is locked stays as it was known.
+    fn renew(&self, known: &mut Known) {
+        renew(&mut known.progress, &self.progress);
+        renew(&mut known.feed, &self.feed);
+        renew(&mut known.import, &self.imports);
+    }
+
+    fn together(&self, Known { mut progress, feed, import }: Known) -> Progress {
         let status = &mut progress.status;
         status.source_ended = self.source_ended.load(Ordering::Relaxed);
         status.frames_dropped = self.frames_dropped.load(Ordering::Relaxed) + feed.late;
@@ -144,7 +176,7 @@ impl Shared {
         status.frames_torn = self.frames_torn.load(Ordering::Relaxed);
         status.frames_missing = self.frames_missing.load(Ordering::Relaxed);
         (status.camera_absent, status.camera_losses) = (feed.absent, feed.losses);
-        status.import = lock(&self.imports);
+        status.import = import;
         progress
     }
 }
@@ -185,12 +217,9 @@ impl Appliance {
         let config = self.site.config.clone();
         let (listener, journal, mut watchdog) = (self.listener, self.journal, self.watchdog);
         let clients = ClientList::new(config.modbus.connections_max);
-        let insight = Arc::new(Insight::new(config.clone(), feed.size_px(), clients.clone()));
+        let insight = Arc::new(Insight::new(config.clone(), feed.size_px(), clients.room()));
         let (page, board) = (self.page, desk::board());
-        let encoder = config.encoder.mm_per_count.map(|mm| {
-            let speed_max_mm_per_s = ENCODER_SPEED_MAX * config.belt.speed_mm_per_s;
-            Encoder::new(mm, config.encoder.bits, config.encoder.timeout_s, speed_max_mm_per_s)
-        });
+        let encoder = encoder(&config);
         let Carved { buffers, pipeline, shots } = super::memory::carve(self.site)?;
         realtime::lock_memory(&config.realtime)?;
         let shared = Shared { imports: self.imports, ..Shared::default() };
@@ -211,29 +240,38 @@ impl Appliance {
         let (photographer, album) = rings.split();
         let mut to_desk = Queue::<ParcelRecord, RECORD_RING>::new();
         let (published_in, published) = to_desk.split();
+        let mut to_desk = Queue::<Commanded, COMMAND_RING>::new();
+        let (commanded_in, commanded) = to_desk.split();
         for buffer in buffers {
             // limits.frames_queued_max is below FRAME_RING.
             let _ = free_in.enqueue(buffer);
         }
         std::thread::scope(|scope| {
-            let shared = &shared;
+            let (shared, config) = (&shared, &config);
             // However this closure is left, the threads must end, or the scope waits for ever.
-            let _stop = StopOnDrop { shared, board: &board };
-            let config = &config;
+            let stop = StopOnDrop { shared, board: &board };
+            let mut services = Vec::new();
             if desk::shots::wanted(pipeline.site()) {
                 let (insight, board) = (Arc::clone(&insight), Arc::clone(&board));
-                let desk = Desk::new(pipeline.site(), shots, album, published, insight, board)?;
-                spawn_service(scope, "desk", move || {
+                let desk = Desk::new(
+                    pipeline.site(),
+                    shots,
+                    album,
+                    (published, commanded),
+                    insight,
+                    board,
+                )?;
+                let desk = move || {
                     shared.desk.get_or_init(std::thread::current);
-                    desk.run(&|| shared.progress(), &|| shared.over.load(Ordering::Acquire))
-                })?;
+                    desk.run(&|| shared.over.load(Ordering::Acquire));
+                    Ok(())
+                };
+                services.push(spawn_service(scope, "desk", shared, desk)?);
             }
             if let Some(page) = page {
                 let (insight, board) = (Arc::clone(&insight), Arc::clone(&board));
-                spawn_service(scope, "web", move || {
-                    realtime::stand_back();
-                    web::serve(&config.web, page, &board, insight)
-                })?;
+                let web = move || web::serve(&config.web, page, &board, insight);
+                services.push(spawn_service(scope, "web", shared, web)?);
             }
             let vision = Vision {
                 pipeline,
@@ -258,11 +296,13 @@ impl Appliance {
                 counts: count_in,
                 requests: request_in,
                 published: published_in,
+                commanded: commanded_in,
                 insight: Arc::clone(&insight),
                 shared,
             };
             let plc = spawn(scope, "plc", move || plc.run())?;
-            while !(capture.is_finished() || vision.is_finished() || plc.is_finished()) {
+            let measuring = [capture, vision, plc];
+            while !measuring.iter().chain(&services).any(Handle::is_finished) {
                 std::thread::park_timeout(PARK);
                 watchdog.look(&shared.beats, [true; 3]);
                 let mut records = std::iter::from_fn(|| observer_out.dequeue());
@@ -270,17 +310,20 @@ impl Appliance {
                     break;
                 }
             }
-            // They end in the order of the flow, so that every frame and record arrives.
-            shared.stop.store(true, Ordering::Relaxed);
-            watch_the_end([&capture, &vision, &plc], &mut watchdog, &shared.beats);
-            let captured = join(capture);
-            let seen = join(vision);
-            let served = join(plc);
+            let measured = end_in_order(measuring, &mut watchdog, shared);
             observe(&shared.progress(), &mut std::iter::from_fn(|| observer_out.dequeue()));
             watchdog.disarm();
-            captured.and(seen).and(served).map(|()| shared.progress())
+            drop(stop);
+            measured.and(services.into_iter().try_for_each(join)).map(|()| shared.progress())
         })
     }
+}
+
+fn encoder(config: &Config) -> Option<Encoder> {
+    let encoder = &config.encoder;
+    let speed_max_mm_per_s = ENCODER_SPEED_MAX * config.belt.speed_mm_per_s;
+    let of = |mm| Encoder::new(mm, encoder.bits, encoder.timeout_s, speed_max_mm_per_s);
+    encoder.mm_per_count.map(of)
 }
 
 /// Lets every thread end.
@@ -313,23 +356,35 @@ fn spawn<'scope, 'env>(
         .map_err(|e| Error::failure(format!("cannot start the {name} thread: {e}")))
 }
 
-/// Start a thread that nobody waits for and whose failure is told, and is no reason to stop measuring.
-fn spawn_service<'scope>(
-    scope: &'scope std::thread::Scope<'scope, '_>,
+/// Start a thread that nobody waits for. One that ends before all is over ends the run: a page or an
+/// archive that is dead for good looks like one where nothing happens.
+fn spawn_service<'scope, 'env>(
+    scope: &'scope std::thread::Scope<'scope, 'env>,
     name: &'static str,
+    shared: &'scope Shared,
     body: impl FnOnce() -> Result<()> + Send + 'scope,
-) -> Result<()> {
+) -> Result<Handle<'scope>> {
     let told = move || {
-        if let Err(e) = body() {
-            tracing::error!("the {name} thread has ended: {e}");
+        realtime::stand_back();
+        let ended = body();
+        if shared.over.load(Ordering::Acquire) {
+            return ended;
         }
+        Err(ended.err().unwrap_or_else(|| Error::failure(format!("the {name} thread has ended"))))
     };
     std::thread::Builder::new()
         .name(name.to_owned())
         .stack_size(SERVICE_STACK_BYTES)
         .spawn_scoped(scope, told)
-        .map(drop)
         .map_err(|e| Error::failure(format!("cannot start the {name} thread: {e}")))
+}
+
+/// They end in the order of the flow, so that every frame and record arrives.
+fn end_in_order(threads: [Handle<'_>; 3], watchdog: &mut Watchdog, shared: &Shared) -> Result<()> {
+    shared.stop.store(true, Ordering::Relaxed);
+    watch_the_end(threads.each_ref(), watchdog, &shared.beats);
+    // Every one is joined, however the one before has ended.
+    threads.map(join).into_iter().collect()
 }
 
 /// Watch the threads until all have ended.
@@ -347,4 +402,44 @@ fn watch_the_end(threads: [&Handle<'_>; 3], watchdog: &mut Watchdog, beats: &Bea
 /// Wait for a thread; a panic in it is a broken invariant and goes on here.
 fn join(handle: Handle<'_>) -> Result<()> {
     handle.join().unwrap_or_else(|panic| std::panic::resume_unwind(panic))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_service_that_ends_before_all_is_over_ends_the_run() {
+        let shared = Shared::default();
+        std::thread::scope(|scope| {
+            let ended = |result: Result<()>| {
+                join(spawn_service(scope, "desk", &shared, || result).expect("starts"))
+            };
+            assert!(ended(Ok(())).is_err_and(|e| e.to_string().contains("the desk thread")));
+            let failed = ended(Err(Error::failure("no more of it")));
+            assert!(failed.is_err_and(|e| e.to_string().contains("no more of it")));
+            shared.end_all();
+            assert!(ended(Ok(())).is_ok());
+        });
+    }
+
+    #[test]
+    fn what_is_locked_stays_as_it_was_known_and_nobody_waits() {
+        let (shared, mut known) = (Shared::default(), Known::default());
+        lock_of(&shared.feed).losses = 1;
+        shared.renew(&mut known);
+        let mut held = (lock_of(&shared.feed), lock_of(&shared.progress), lock_of(&shared.imports));
+        (held.0.losses, held.2.count) = (2, 9);
+        // It would wait for ever.
+        shared.renew(&mut known);
+        assert_eq!((known.feed.losses, known.import.count), (1, 0));
+        drop(held);
+        shared.renew(&mut known);
+        let status = shared.together(known).status;
+        assert_eq!((status.camera_losses, status.import.count), (2, 9));
+    }
+
+    fn lock_of<T>(mutex: &Mutex<T>) -> std::sync::MutexGuard<'_, T> {
+        mutex.lock().expect("whole")
+    }
 }

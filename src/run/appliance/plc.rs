@@ -1,6 +1,6 @@
 //! The PLC thread: records out over Modbus and CAN, counts and requests in, the desk told of both.
 
-use super::{FAREWELL, Shared};
+use super::{FAREWELL, Known, Progress, Shared};
 use crate::config::Config;
 use crate::error::Result;
 use crate::event::ParcelRecord;
@@ -8,7 +8,7 @@ use crate::plc::can::CanLink;
 use crate::plc::clients::ClientList;
 use crate::plc::command::Request;
 use crate::plc::journal::Journal;
-use crate::plc::link::Link;
+use crate::plc::link::{Commanded, Link};
 use crate::plc::modbus;
 use crate::run::desk::{Insight, is_due};
 use heapless::spsc::{Consumer, Producer};
@@ -32,6 +32,8 @@ pub(super) struct PlcThread<'a> {
     pub(super) requests: Producer<'a, Request>,
     /// To the desk: what was published.
     pub(super) published: Producer<'a, ParcelRecord>,
+    /// To the desk: what was commanded.
+    pub(super) commanded: Producer<'a, Commanded>,
     pub(super) insight: Arc<Insight>,
     pub(super) shared: &'a Shared,
 }
@@ -46,7 +48,8 @@ impl PlcThread<'_> {
         let order = config.modbus.word_order;
         let link = Link::new(config.plc.clone(), order, sends, self.journal, start)
             .with_encoder(config.encoder.mm_per_count);
-        let (mut ended_at, mut told) = (None, None);
+        let (mut ended_at, mut told, mut known) = (None, None, Known::default());
+        let (clients, mut untold) = (self.clients.clone(), 0);
         modbus::serve(self.listener, &config.modbus, self.clients, link, |link| {
             shared.beats.plc.beat();
             // Asked before the ring is emptied: what came before the end is published.
@@ -59,16 +62,29 @@ impl PlcThread<'_> {
                 link.flush();
                 ended_at.get_or_insert(now);
             }
-            link.update(&shared.progress().status, &can.status(), encoder_timeout, now);
+            shared.renew(&mut known);
+            let Progress { status: mut vision, frame_time_max } = shared.together(known);
+            vision.archive_fails = self.insight.archive_fails();
+            link.update(&vision, &can.status(), encoder_timeout, now);
             can.step(link, now);
+            // Before the first parcel is told: whoever keeps it knows which start of the machine this is.
+            if is_due(told, now) && self.insight.plc_tells(link, frame_time_max, &clients) {
+                told = Some(now);
+            }
             while let Some(record) = link.next_published() {
                 let missed = self.published.enqueue(record).is_err();
                 self.insight.parcels_missed.fetch_add(u64::from(missed), Ordering::Relaxed);
                 shared.wake_desk();
             }
-            if is_due(&mut told, now) {
-                self.insight.plc_tells(link);
+            let missed = &self.insight.commands_missed;
+            while let Some(given) = link.next_commanded() {
+                missed.fetch_add(
+                    u64::from(self.commanded.enqueue(given).is_err()),
+                    Ordering::Relaxed,
+                );
             }
+            missed.fetch_add(link.commands_untold() - untold, Ordering::Relaxed);
+            untold = link.commands_untold();
             // A ring that is full has enough of them: vision has not looked for long.
             while let Some(count) = link.next_count() {
                 let _ = self.counts.enqueue(count);

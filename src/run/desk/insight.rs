@@ -5,7 +5,7 @@ use crate::archive::{Condition, Reader, Stored};
 use crate::config::{Config, WordOrder};
 use crate::plc::clients::{Client, ClientList};
 use crate::plc::command::Sender;
-use crate::plc::link::{Commanded, Link};
+use crate::plc::link::Link;
 use crate::plc::registers::{
     COMMAND, COMMAND_FIELDS, COUNT, LATEST, MAP_VERSION, PARCEL_FIELDS, STATUS_FIELDS, Status,
 };
@@ -13,7 +13,7 @@ use crate::plc::table::{Field, Type, join};
 use crate::run::log;
 use crate::web;
 use std::path::PathBuf;
-use std::sync::atomic::{AtomicU64, Ordering};
+use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
 use std::sync::{Mutex, MutexGuard, PoisonError};
 use std::time::{Duration, Instant, SystemTime, UNIX_EPOCH};
 
@@ -27,8 +27,10 @@ pub struct PlcSide {
     pub status: Status,
     registers: [u16; COUNT as usize],
     written: Option<(Sender, Instant)>,
-    /// The last command.
-    pub commanded: Option<Commanded>,
+    /// The slowest frame so far.
+    frame_time_max: Duration,
+    /// When that was, ms since 1970; 0: not yet.
+    pub(super) told_utc_ms: u64,
 }
 
 /// What is known, for whoever asks.
@@ -37,15 +39,24 @@ pub struct Insight {
     image_size_px: [usize; 2],
     started: Instant,
     plc: Mutex<PlcSide>,
-    clients: ClientList,
-    frame_time_max: Mutex<Duration>,
+    clients: Mutex<Vec<Client>>,
     archive: Mutex<Condition>,
+    archive_fails: AtomicBool,
     /// Parcels whose dimensions may be used.
     pub usable: AtomicU64,
-    /// Parcels without a picture.
+    /// Parcels without a picture, because too many came at once.
     pub pictures_missed: AtomicU64,
     /// Parcels that the desk was not told of.
     pub parcels_missed: AtomicU64,
+    /// Commands that the desk was not told of.
+    pub commands_missed: AtomicU64,
+}
+
+impl PlcSide {
+    /// Whether the PLC thread has told anything yet.
+    pub fn is_known(&self) -> bool {
+        self.told_utc_ms > 0
+    }
 }
 
 fn lock<T>(mutex: &Mutex<T>) -> MutexGuard<'_, T> {
@@ -59,7 +70,7 @@ pub fn utc_ms() -> u64 {
 
 impl Insight {
     /// Nothing is known yet.
-    pub fn new(config: Config, image_size_px: [usize; 2], clients: ClientList) -> Self {
+    pub fn new(config: Config, image_size_px: [usize; 2], clients_max: usize) -> Self {
         let status = Status::default();
         Self {
             config,
@@ -69,26 +80,32 @@ impl Insight {
                 status,
                 registers: [0; COUNT as usize],
                 written: None,
-                commanded: None,
+                frame_time_max: Duration::ZERO,
+                told_utc_ms: 0,
             }),
-            clients,
-            frame_time_max: Mutex::default(),
+            clients: Mutex::new(Vec::with_capacity(clients_max)),
             archive: Mutex::default(),
+            archive_fails: AtomicBool::new(false),
             usable: AtomicU64::new(0),
             pictures_missed: AtomicU64::new(0),
             parcels_missed: AtomicU64::new(0),
+            commands_missed: AtomicU64::new(0),
         }
     }
 
-    /// The PLC thread tells what it knows; it never waits for a reader.
-    pub fn plc_tells(&self, link: &Link) {
-        if let Ok(mut plc) = self.plc.try_lock() {
-            plc.status = *link.status();
-            (plc.written, plc.commanded) = (link.written(), link.commanded());
-            if let Some(registers) = link.read(0, COUNT) {
-                plc.registers.copy_from_slice(registers);
-            }
+    /// The PLC thread tells what it knows; it never waits for a reader. Whether it could.
+    pub fn plc_tells(&self, link: &Link, frame_time_max: Duration, clients: &ClientList) -> bool {
+        let (Ok(mut plc), Ok(mut list)) = (self.plc.try_lock(), self.clients.try_lock()) else {
+            return false;
+        };
+        plc.status = *link.status();
+        (plc.written, plc.frame_time_max) = (link.written(), frame_time_max);
+        if let Some(registers) = link.read(0, COUNT) {
+            plc.registers.copy_from_slice(registers);
         }
+        plc.told_utc_ms = utc_ms();
+        clients.copy_to(&mut list);
+        true
     }
 
     /// What the PLC thread has told last.
@@ -97,11 +114,16 @@ impl Insight {
     }
 
     /// The desk tells what it knows.
-    pub fn desk_tells(&self, frame_time_max: Duration, archive: Option<Condition>) {
-        *lock(&self.frame_time_max) = frame_time_max;
+    pub fn desk_tells(&self, archive: Option<Condition>) {
         if let Some(condition) = archive {
+            self.archive_fails.store(condition.is_bad(), Ordering::Relaxed);
             *lock(&self.archive) = condition;
         }
+    }
+
+    /// Whether somebody should look after the archive; never waits.
+    pub fn archive_fails(&self) -> bool {
+        self.archive_fails.load(Ordering::Relaxed)
     }
 
     fn archive_folder(&self) -> Result<&PathBuf, String> {
@@ -118,27 +140,24 @@ impl Insight {
             bytes: condition.bytes,
             bytes_max: condition.bytes_max,
             fault: condition.fault,
+            damaged: condition.damaged,
         }
     }
 }
 
 /// Whether the PLC thread is to tell again.
-pub fn is_due(told: &mut Option<Instant>, now: Instant) -> bool {
-    let due = told.is_none_or(|at| now - at >= PERIOD);
-    if due {
-        *told = Some(now);
-    }
-    due
+pub fn is_due(told: Option<Instant>, now: Instant) -> bool {
+    told.is_none_or(|at| now - at >= PERIOD)
 }
 
 impl web::Machine for Insight {
     fn state(&self) -> web::State {
-        let status = self.plc_side().status;
+        let PlcSide { status, frame_time_max, told_utc_ms, .. } = self.plc_side();
         let (vision, counters) = (&status.vision, &status.vision.counters);
         let count = |counter: &AtomicU64| counter.load(Ordering::Relaxed);
         web::State {
             version: env!("CARGO_PKG_VERSION"),
-            utc_ms: utc_ms(),
+            utc_ms: told_utc_ms,
             uptime_s: self.started.elapsed().as_secs_f64(),
             boots: status.boots,
             lamps: lamps(&status),
@@ -153,7 +172,7 @@ impl web::Machine for Insight {
                 frames_dropped: vision.frames_dropped,
                 frames_lost: vision.frames_lost,
                 frames_torn: vision.frames_torn,
-                frame_time_max_ms: lock(&self.frame_time_max).as_secs_f64() * 1e3,
+                frame_time_max_ms: frame_time_max.as_secs_f64() * 1e3,
             },
             belt: web::BeltState {
                 speed_mm_per_s: vision.belt_speed_mm_per_s,
@@ -177,6 +196,7 @@ impl web::Machine for Insight {
                 ],
                 pictures_missed: count(&self.pictures_missed),
                 parcels_missed: count(&self.parcels_missed),
+                commands_missed: count(&self.commands_missed),
                 log_lines_dropped: log::lines_dropped(),
             },
             archive: self.archive_state(),
@@ -184,7 +204,7 @@ impl web::Machine for Insight {
     }
 
     fn plc(&self) -> web::Plc {
-        let plc = self.plc_side();
+        let (plc, clients) = (self.plc_side(), lock(&self.clients).clone());
         let (config, order) = (&self.config, self.config.modbus.word_order);
         let client = |client: Client| web::Client {
             address: client.address.to_string(),
@@ -202,7 +222,7 @@ impl web::Machine for Insight {
                 sender: sender.to_string(),
                 seconds_ago: at.elapsed().as_secs_f64(),
             }),
-            clients: self.clients.connected().into_iter().map(client).collect(),
+            clients: clients.into_iter().map(client).collect(),
             can_interface: config.can.interface.clone(),
         }
     }
@@ -266,9 +286,75 @@ fn values<S>(
 }
 
 #[cfg(test)]
-mod tests {
+pub mod tests {
     use super::*;
+    use crate::plc::journal::Journal;
     use crate::plc::registers::RegisterImage;
+    use crate::web::Machine;
+
+    /// Of a plain configuration.
+    pub fn insight() -> Insight {
+        let config = "[camera]\ncalibration = \"c\"\n[belt]\nspeed_mm_per_s = 500\n\
+            [zone]\nx_min_mm = -600\nx_max_mm = 600\ny_min_mm = -380\ny_max_mm = 380\n";
+        Insight::new(Config::parse(config).expect("valid"), [0; 2], 4)
+    }
+
+    #[test]
+    fn the_plc_thread_waits_for_no_reader_and_the_time_is_that_of_its_last_word() {
+        let insight = insight();
+        let clients = ClientList::new(1);
+        let settings = insight.config.plc.clone();
+        let now = Instant::now();
+        let link = Link::new(settings, WordOrder::HighFirst, false, Journal::default(), now);
+        let tells = || insight.plc_tells(&link, Duration::from_millis(7), &clients);
+        assert_eq!(insight.state().utc_ms, 0, "nothing is known");
+        for reader in [&insight.clients as &dyn Locked, &insight.plc] {
+            // It would wait for ever.
+            reader.while_read(&mut || assert!(!tells()));
+        }
+        assert!(!insight.plc_side().is_known());
+        assert!(tells() && insight.plc_side().is_known());
+        let told = insight.state();
+        assert!(told.utc_ms > 0 && (told.camera.frame_time_max_ms - 7.0).abs() < 1e-9);
+        let start = Instant::now();
+        while utc_ms() == told.utc_ms {
+            assert!(start.elapsed() < Duration::from_secs(9), "the clock stands still");
+        }
+        assert_eq!(insight.state().utc_ms, told.utc_ms, "it was not told again");
+    }
+
+    #[test]
+    fn an_archive_that_needs_attention_is_a_reason_and_a_fault_bit_of_the_plc() {
+        let insight = insight();
+        let reasons = |condition: Condition| {
+            insight.desk_tells(Some(condition));
+            let mut status = Status { running: true, ..Status::default() };
+            status.vision.ready = true;
+            status.vision.archive_fails = insight.archive_fails();
+            (status.reasons().collect::<Vec<_>>(), status.fault_bits() >> 11)
+        };
+        let some = || Some("a word".to_owned());
+        for bad in [
+            Condition { lost: 1, ..Condition::default() },
+            Condition { fault: some(), ..Condition::default() },
+            Condition { damaged: some(), ..Condition::default() },
+        ] {
+            assert_eq!(reasons(bad), (vec![20], 1));
+        }
+        assert_eq!(reasons(Condition { written: 9, ..Condition::default() }), (vec![], 0));
+    }
+
+    /// A lock of any content.
+    trait Locked {
+        fn while_read(&self, what: &mut dyn FnMut());
+    }
+
+    impl<T> Locked for Mutex<T> {
+        fn while_read(&self, what: &mut dyn FnMut()) {
+            let _held = lock(self);
+            what();
+        }
+    }
 
     #[test]
     fn the_page_shows_what_the_registers_hold_in_both_word_orders() {

@@ -4,7 +4,7 @@ use crate::plc::registers::Status;
 use crate::web::Lamp;
 
 /// Which lamp a code lights: `None` lets `running` go out without any other.
-pub const LAMPS: [(u16, Option<&str>); 19] = [
+pub const LAMPS: [(u16, Option<&str>); 20] = [
     (1, Some(FAILURE)),
     (2, Some(FAILURE)),
     (3, Some(FAILURE)),
@@ -18,6 +18,7 @@ pub const LAMPS: [(u16, Option<&str>); 19] = [
     (5, Some(MAINTENANCE)),
     (6, Some(MAINTENANCE)),
     (15, Some(MAINTENANCE)),
+    (20, Some(MAINTENANCE)),
     (16, Some(UNCERTAIN)),
     (17, Some(UNCERTAIN)),
     (18, Some(UNCERTAIN)),

@@ -16,13 +16,12 @@ pub mod shots;
 pub use insight::{Insight, is_due};
 pub use shots::{Album, Photographer, Rings, Shot};
 
-use super::appliance::Progress;
-use super::realtime;
 use crate::archive::{self, Archive};
 use crate::config::{Config, DimensionOrder, Site};
 use crate::error::{Error, Result};
 use crate::event::ParcelRecord;
-use crate::web::{self, Board, View};
+use crate::plc::link::Commanded;
+use crate::web::{self, Board, NoPicture, View};
 use heapless::spsc::Consumer;
 use insight::utc_ms;
 use jpeg_encoder::{ColorType, Encoder};
@@ -57,6 +56,8 @@ pub struct Desk<'a> {
     pub album: Album<'a>,
     /// What the PLC was told.
     pub published: Consumer<'a, ParcelRecord>,
+    /// What the PLC has commanded.
+    pub commanded: Consumer<'a, Commanded>,
     /// What the page asks.
     pub insight: Arc<Insight>,
     /// What the page shows.
@@ -67,6 +68,8 @@ pub struct Desk<'a> {
     /// Live shots that are here, and when each kind was last asked for.
     live: [(Option<Shot>, Option<Instant>); LIVE],
     waiting: VecDeque<Waiting>,
+    /// The last frames with a parcel that there was no room for a picture of.
+    missed: Missed,
     news: News,
     looked: Option<Instant>,
 }
@@ -76,6 +79,24 @@ struct Waiting {
     framing: Framing,
     sight: crate::pipeline::Sight,
     jpeg: Vec<u8>,
+}
+
+/// Frames with a parcel that there was no room for a picture of.
+#[derive(Default)]
+struct Missed(VecDeque<u64>);
+
+impl Missed {
+    fn note(&mut self, frame: u64) {
+        if self.0.len() == WAITING_MAX {
+            self.0.pop_front();
+        }
+        self.0.push_back(frame);
+    }
+
+    /// Why there is no picture of a parcel whose record is of a frame.
+    fn why(&self, frame: u64) -> NoPicture {
+        if self.0.contains(&frame) { NoPicture::TooMany } else { NoPicture::NotInMiddle }
+    }
 }
 
 /// An entry of the archive.
@@ -98,7 +119,7 @@ impl<'a> Desk<'a> {
         site: &Site,
         shots: Vec<Shot>,
         mut album: Album<'a>,
-        published: Consumer<'a, ParcelRecord>,
+        (published, commanded): (Consumer<'a, ParcelRecord>, Consumer<'a, Commanded>),
         insight: Arc<Insight>,
         board: Arc<Board>,
     ) -> Result<Self> {
@@ -119,6 +140,7 @@ impl<'a> Desk<'a> {
         Ok(Self {
             album,
             published,
+            commanded,
             insight,
             board,
             geometry: Geometry::new(site),
@@ -126,28 +148,36 @@ impl<'a> Desk<'a> {
             config,
             live,
             waiting: VecDeque::new(),
+            missed: Missed::default(),
             news: News::new(Instant::now()),
             looked: None,
         })
     }
 
     /// Until it is over; what came before is told.
-    pub fn run(mut self, progress: &dyn Fn() -> Progress, over: &dyn Fn() -> bool) -> Result<()> {
-        realtime::stand_back();
+    pub fn run(mut self, over: &dyn Fn() -> bool) {
         self.board.is_served_here();
-        self.happened(event(utc_ms(), "started", 0, env!("CARGO_PKG_VERSION").to_owned()));
+        let mut started = false;
         loop {
             // Asked before the rings are emptied.
             let over = over();
-            self.take_shots()?;
-            while let Some(record) = self.published.dequeue() {
+            self.take_shots();
+            // The first entry says which start of the machine this is: the PLC's thread knows.
+            if !started && (over || self.insight.plc_side().is_known()) {
+                started = true;
+                self.happened(event(utc_ms(), "started", 0, env!("CARGO_PKG_VERSION").to_owned()));
+            }
+            while started && let Some(record) = self.published.dequeue() {
                 self.parcel(record);
+            }
+            while started && let Some(given) = self.commanded.dequeue() {
+                self.happened(news::command(utc_ms(), &given));
             }
             let now = Instant::now();
             if over || self.looked.is_none_or(|at| now - at >= NEWS) {
                 self.looked = Some(now);
                 let condition = self.archive.as_ref().map(Archive::condition);
-                self.insight.desk_tells(progress().frame_time_max, condition);
+                self.insight.desk_tells(condition);
                 for event in self.news.look(&self.insight.plc_side(), utc_ms(), now) {
                     self.happened(event);
                 }
@@ -162,7 +192,6 @@ impl<'a> Desk<'a> {
         if let Some(archive) = self.archive {
             archive.finish(FAREWELL);
         }
-        Ok(())
     }
 
     /// Ask for the live pictures that somebody waits for; returns how long to sleep.
@@ -185,27 +214,33 @@ impl<'a> Desk<'a> {
         sleep
     }
 
-    fn take_shots(&mut self) -> Result<()> {
+    fn take_shots(&mut self) {
+        while let Some(frame) = self.album.missed.dequeue() {
+            self.missed.note(frame);
+        }
         while let Some(shot) = self.album.taken.dequeue() {
             match shot.framing.subject {
-                Subject::Raw => self.put_up(View::Raw, shot)?,
-                Subject::Belt => self.put_up(View::Belt, shot)?,
+                Subject::Raw => self.put_up(View::Raw, shot),
+                Subject::Belt => self.put_up(View::Belt, shot),
                 Subject::Parcel => {
-                    self.keep(&shot)?;
+                    tell_failure(self.keep(&shot));
                     let _ = self.album.spare.enqueue(shot); // invariant: there is room for all
                 }
             }
         }
-        Ok(())
     }
 
-    fn put_up(&mut self, view: View, shot: Shot) -> Result<()> {
-        let scene = self.geometry.scene(&shot);
+    fn put_up(&mut self, view: View, shot: Shot) {
+        tell_failure(self.show(view, &shot));
+        self.live[view as usize].0 = Some(shot);
+    }
+
+    fn show(&self, view: View, shot: &Shot) -> Result<()> {
+        let scene = self.geometry.scene(shot);
         let mut bytes = json(&scene)?.into_bytes();
         bytes.push(b'\n');
         encode(shot.pixels(), shot.framing.size_px, LIVE_QUALITY, &mut bytes)?;
         self.board.picture(view, scene.frame, bytes);
-        self.live[view as usize].0 = Some(shot);
         Ok(())
     }
 
@@ -214,8 +249,10 @@ impl<'a> Desk<'a> {
         let Some(sight) = shot.sights.first() else { return Ok(()) };
         let mut jpeg = Vec::new();
         encode(&stretched(shot.pixels()), shot.framing.size_px, PARCEL_QUALITY, &mut jpeg)?;
-        if self.waiting.len() == WAITING_MAX {
-            self.waiting.pop_front();
+        if self.waiting.len() == WAITING_MAX
+            && let Some(oldest) = self.waiting.pop_front()
+        {
+            self.missed.note(oldest.framing.time.index);
         }
         self.waiting.push_back(Waiting { framing: shot.framing, sight: *sight, jpeg });
         Ok(())
@@ -235,7 +272,8 @@ impl<'a> Desk<'a> {
 
     fn parcel(&mut self, record: ParcelRecord) {
         let waiting = self.picture_of(&record);
-        if waiting.is_none() {
+        let no_picture = waiting.is_none().then(|| self.missed.why(record.frame));
+        if no_picture == Some(NoPicture::TooMany) {
             self.insight.pictures_missed.fetch_add(1, Ordering::Relaxed);
         }
         self.insight.usable.fetch_add(u64::from(record.may_be_used), Ordering::Relaxed);
@@ -248,7 +286,7 @@ impl<'a> Desk<'a> {
         let jpeg = waiting.map(|waiting| waiting.jpeg).unwrap_or_default();
         // What the PLC's rounding left behind the last digit is noise.
         let record = record.rounded();
-        let parcel = web::Parcel { n: 0, utc_ms: utc_ms(), record, picture };
+        let parcel = web::Parcel { n: 0, utc_ms: utc_ms(), record, picture, no_picture };
         let parcel = self.board.parcel(parcel, jpeg.clone());
         self.archive(archive::Kind::Parcel, parcel.utc_ms, &*parcel, jpeg);
     }
@@ -265,6 +303,13 @@ impl<'a> Desk<'a> {
         if let Ok(text) = json(&kept) {
             archive.put(archive::Entry { kind, utc_ms, text, picture });
         }
+    }
+}
+
+/// A picture that fails is no reason to make no others.
+fn tell_failure(made: Result<()>) {
+    if let Err(e) = made {
+        tracing::error!("{e}");
     }
 }
 
@@ -304,6 +349,15 @@ fn stretched(pixels: &[u8]) -> Vec<u8> {
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn why_there_is_no_picture_is_known_of_the_last_frames() {
+        let mut missed = Missed::default();
+        (0..1000).for_each(|frame| missed.note(2 * frame));
+        assert_eq!(missed.why(1998), NoPicture::TooMany);
+        assert_eq!(missed.why(1997), NoPicture::NotInMiddle);
+        assert_eq!(missed.0.len(), WAITING_MAX);
+    }
 
     #[test]
     fn a_dark_picture_is_stretched_and_a_plain_one_stays_plain() {

@@ -1,6 +1,7 @@
 //! Events: what began, ended or happened, told once.
 
 use super::insight::PlcSide;
+use crate::plc::link::Commanded;
 use crate::web::Event;
 use std::time::{Duration, Instant};
 
@@ -16,9 +17,17 @@ pub struct News {
     started: Instant,
     /// What is the case, and when it last was.
     holding: Vec<(u16, Instant)>,
-    ticket: Option<u16>,
     camera_losses: u64,
     imports: Option<u16>,
+}
+
+/// A command of the PLC.
+pub fn command(utc_ms: u64, given: &Commanded) -> Event {
+    let detail = format!(
+        "{}: ticket {}, argument {}, result {}",
+        given.sender, given.ticket, given.argument, given.outcome
+    );
+    event(utc_ms, "command", u32::from(given.command), detail)
 }
 
 /// An event that has no number yet.
@@ -29,12 +38,15 @@ pub fn event(utc_ms: u64, kind: &'static str, code: u32, detail: String) -> Even
 impl News {
     /// Nothing has happened.
     pub fn new(now: Instant) -> Self {
-        Self { started: now, holding: Vec::new(), ticket: None, camera_losses: 0, imports: None }
+        Self { started: now, holding: Vec::new(), camera_losses: 0, imports: None }
     }
 
     /// What is new since it last looked.
     pub fn look(&mut self, plc: &PlcSide, utc_ms: u64, now: Instant) -> Vec<Event> {
         let mut news = Vec::new();
+        if !plc.is_known() {
+            return news;
+        }
         let mut tell = |kind, code, detail| news.push(event(utc_ms, kind, code, detail));
         let status = &plc.status;
         let starting = now - self.started < STARTING;
@@ -57,17 +69,6 @@ impl News {
             tell("camera_lost", status.vision.camera_losses as u32, String::new());
         }
         self.camera_losses = status.vision.camera_losses;
-        // A ticket of the run before is no news; a command of this one is, as soon as it is carried out.
-        if self.ticket.is_some_and(|known| known != status.ticket)
-            && let Some(given) = plc.commanded.filter(|given| given.ticket == status.ticket)
-        {
-            let detail = format!(
-                "{}: ticket {}, argument {}, result {}",
-                given.sender, given.ticket, given.argument, status.outcome
-            );
-            tell("command", u32::from(given.command), detail);
-        }
-        self.ticket = Some(status.ticket);
         let import = status.vision.import;
         if self.imports.is_some_and(|known| known != import.count) {
             tell("import", u32::from(import.result), String::new());
@@ -80,16 +81,12 @@ impl News {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::plc::clients::ClientList;
     use crate::plc::command::Sender;
-    use crate::plc::link::Commanded;
-    use crate::run::desk::insight::Insight;
+    use crate::run::desk::insight::tests::insight;
 
     fn plc() -> PlcSide {
-        let config = "[camera]\ncalibration = \"c\"\n[belt]\nspeed_mm_per_s = 500\n\
-            [zone]\nx_min_mm = -600\nx_max_mm = 600\ny_min_mm = -380\ny_max_mm = 380\n";
-        let config = crate::config::Config::parse(config).expect("valid");
-        let mut plc = Insight::new(config, [0; 2], ClientList::new(1)).plc_side();
+        let mut plc = insight().plc_side();
+        plc.told_utc_ms = 1;
         plc.status.running = true;
         plc.status.vision.ready = true;
         plc
@@ -109,18 +106,23 @@ mod tests {
     }
 
     #[test]
-    fn a_command_is_told_with_its_sender_once_and_not_after_a_restart() {
+    fn a_command_is_told_with_its_sender() {
+        let given =
+            Commanded { sender: Sender::Can, ticket: 10, command: 5, argument: 50, outcome: 1 };
+        let told = command(7, &given);
+        assert_eq!((told.kind, told.code, told.utc_ms), ("command", 5, 7));
+        assert_eq!(told.detail, "CAN: ticket 10, argument 50, result 1");
+    }
+
+    #[test]
+    fn what_was_before_the_start_is_no_news() {
         let start = Instant::now();
-        let (mut news, mut plc) = (News::new(start), plc());
-        plc.status.ticket = 9;
-        assert!(news.look(&plc, 0, start).is_empty(), "of the run before");
-        let given = Commanded { sender: Sender::Can, ticket: 10, command: 5, argument: 50 };
-        plc.commanded = Some(given);
-        assert!(news.look(&plc, 0, start).is_empty(), "not carried out yet");
-        (plc.status.ticket, plc.status.outcome) = (10, 1);
-        let told = news.look(&plc, 7, start);
-        assert_eq!((told.len(), told[0].kind, told[0].code, told[0].utc_ms), (1, "command", 5, 7));
-        assert!(told[0].detail.contains("CAN: ticket 10, argument 50, result 1"), "{told:?}");
-        assert!(news.look(&plc, 0, start).is_empty());
+        let (mut news, mut side) = (News::new(start), insight().plc_side());
+        assert!(news.look(&side, 0, start).is_empty(), "nothing is known yet");
+        (side.told_utc_ms, side.status.running, side.status.vision.ready) = (1, true, true);
+        side.status.vision.import.count = 3;
+        assert!(news.look(&side, 0, start).is_empty(), "imported before");
+        side.status.vision.import.count = 4;
+        assert_eq!(news.look(&side, 0, start).len(), 1);
     }
 }

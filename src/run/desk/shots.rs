@@ -17,6 +17,8 @@ use heapless::spsc::{Consumer, Producer, Queue};
 pub const LIVE: usize = 2;
 /// Pictures of single parcels on their way.
 const PARCELS: usize = 6;
+/// Frames of parcels that no shot was left for, on their way, and one.
+const MISSED: usize = 64;
 /// Places in the rings: any shot may be in any of them.
 const RING: usize = LIVE + PARCELS + 1;
 /// Sides of a live picture, at most: a frame is shrunk by whole factors until it fits.
@@ -70,6 +72,7 @@ pub struct Rings {
     asked: Queue<Shot, RING>,
     taken: Queue<Shot, RING>,
     spare: Queue<Shot, RING>,
+    missed: Queue<u64, MISSED>,
 }
 
 /// Vision's end.
@@ -77,6 +80,7 @@ pub struct Photographer<'a> {
     asked: Consumer<'a, Shot>,
     spare: Consumer<'a, Shot>,
     taken: Producer<'a, Shot>,
+    missed: Producer<'a, u64>,
 }
 
 /// The desk's end.
@@ -87,6 +91,8 @@ pub struct Album<'a> {
     pub spare: Producer<'a, Shot>,
     /// Filled ones.
     pub taken: Consumer<'a, Shot>,
+    /// Numbers of frames with a parcel that no shot was left for.
+    pub missed: Consumer<'a, u64>,
 }
 
 /// The factor that brings sides within a limit.
@@ -139,16 +145,17 @@ pub fn shots(site: &Site, memory: &mut Memory) -> Result<std::vec::Vec<Shot>> {
 impl Rings {
     /// Nothing is on its way.
     pub fn new() -> Self {
-        Self { asked: Queue::new(), taken: Queue::new(), spare: Queue::new() }
+        Self { asked: Queue::new(), taken: Queue::new(), spare: Queue::new(), missed: Queue::new() }
     }
 
     /// Both ends.
     pub fn split(&mut self) -> (Photographer<'_>, Album<'_>) {
         let ((asked_in, asked), (spare_in, spare)) = (self.asked.split(), self.spare.split());
         let (taken, taken_out) = self.taken.split();
+        let (missed, missed_out) = self.missed.split();
         (
-            Photographer { asked, spare, taken },
-            Album { asked: asked_in, spare: spare_in, taken: taken_out },
+            Photographer { asked, spare, taken, missed },
+            Album { asked: asked_in, spare: spare_in, taken: taken_out, missed: missed_out },
         )
     }
 }
@@ -168,16 +175,22 @@ impl Photographer<'_> {
             any |= self.taken.enqueue(shot).is_ok();
         }
         for sight in pipeline.passing_middle() {
-            // Without one there is no picture of it: the desk sees that.
-            let Some(mut shot) = self.spare.dequeue() else { break };
-            let view = pipeline.view();
-            let region = around(&sight, [view.width(), view.height()]);
-            let size_px = [0, 1].map(|i| region[1][i] - region[0][i]);
-            shot.take(view, region, factor(size_px, PARCEL_SIDES_PX), time);
-            let _ = shot.sights.push(sight);
-            any |= self.taken.enqueue(shot).is_ok();
+            any |= self.of_parcel(sight, pipeline.view(), time);
         }
         any
+    }
+
+    fn of_parcel(&mut self, sight: Sight, view: Plane<'_>, time: FrameTime) -> bool {
+        let Some(mut shot) = self.spare.dequeue() else {
+            // There is no picture of it: the desk is told why.
+            let _ = self.missed.enqueue(time.index);
+            return false;
+        };
+        let region = around(&sight, [view.width(), view.height()]);
+        let size_px = [0, 1].map(|i| region[1][i] - region[0][i]);
+        shot.take(view, region, factor(size_px, PARCEL_SIDES_PX), time);
+        let _ = shot.sights.push(sight);
+        self.taken.enqueue(shot).is_ok()
     }
 }
 
@@ -298,6 +311,21 @@ mod tests {
                 assert!((back[0] - x as f64).abs() < 1e-9 && (back[1] - y as f64).abs() < 1e-9);
             }
         }
+    }
+
+    #[test]
+    fn a_parcel_that_no_shot_is_left_for_is_told_with_its_frame() {
+        let bounds = [BeltPx { u: 1.0, v: 1.0 }, BeltPx { u: 4.0, v: 4.0 }];
+        let sight = Sight { slot: 0, riding: true, told: false, bounds, cuboid: None };
+        let view = Plane::packed(&[0; 64], 8, 8).expect("fits");
+        let mut rings = Rings::new();
+        let (mut photographer, mut album) = rings.split();
+        let _ = album.spare.enqueue(taken([8, 8], [[0, 0], [8, 8]], 1));
+        for index in [5, 6] {
+            photographer.of_parcel(sight, view, FrameTime { index, t_s: 0.0 });
+        }
+        assert_eq!(album.taken.dequeue().map(|shot| shot.framing.time.index), Some(5));
+        assert_eq!((album.missed.dequeue(), album.missed.dequeue()), (Some(6), None));
     }
 
     #[test]

@@ -14,6 +14,9 @@ const THEMES = ["auto", "light", "dark"];
 const element = (id) => document.getElementById(id);
 let leave = new AbortController();
 let newest = null;
+// When the state's time last moved: lamps of an old state are worth nothing.
+const STALE_MS = 3000;
+let [renewed, stale, silentSince] = [performance.now(), false, null];
 let theme = THEMES.includes(remembered("theme")) ? remembered("theme") : "auto";
 
 function showTheme() {
@@ -24,11 +27,12 @@ function showTheme() {
 }
 
 function showLamps(state) {
+  const word = (lamp) => (stale ? t("lamp.unknown") : lamp.on ? t("lamp.on") : t("lamp.off"));
   element("lamps").replaceChildren(...state.lamps.map((lamp) =>
-    h("li", { class: `${lamp.name} ${lamp.on ? "on" : ""}`, title: lamp.reasons.map((code) => t(`reason.${code}`)).join("\n") },
+    h("li", { class: `${lamp.name} ${lamp.on && !stale ? "on" : ""}`, title: lamp.reasons.map((code) => t(`reason.${code}`)).join("\n") },
       h("span", { class: "dot", "aria-hidden": "true" }),
       `${t(`lamp.${lamp.name}`)}`,
-      h("span", { class: "soft" }, lamp.on ? t("lamp.on") : t("lamp.off")))));
+      h("span", { class: "soft" }, word(lamp)))));
   element("footer").textContent = t("footer", {
     version: state.version, clock: time(state.utc_ms), hours: number(state.uptime_s / 3600, 1), boots: count(state.boots),
   });
@@ -54,7 +58,25 @@ function show() {
   if (newest) tell(newest);
 }
 
+function showAge() {
+  const isStale = performance.now() - renewed > STALE_MS;
+  if (isStale !== stale) {
+    stale = isStale;
+    document.documentElement.classList.toggle("stale", stale);
+    if (newest) showLamps(newest);
+  }
+  const banner = element("offline");
+  banner.hidden = !stale && silentSince === null;
+  if (banner.hidden) return;
+  const words = silentSince === null && newest ? t("stale", { since: time(newest.utc_ms) })
+    : t("offline", { since: silentSince === null ? "…" : time(silentSince) });
+  // It is read aloud when it changes, not twice a second.
+  if (banner.textContent !== words) banner.textContent = words;
+}
+
 function tell(state) {
+  // The clock may be set back: that it moves is what counts.
+  if (state.utc_ms !== newest?.utc_ms) renewed = performance.now();
   newest = state;
   showLamps(state);
   document.dispatchEvent(new CustomEvent("state", { detail: state }));
@@ -74,10 +96,11 @@ window.addEventListener("hashchange", () => {
   element("main").focus();
 });
 whenSilent((since) => {
-  element("offline").hidden = since === null;
-  if (since !== null) element("offline").textContent = t("offline", { since: time(since) });
+  silentSince = since;
+  showAge();
 });
 
 await chooseLanguage();
 show();
+setInterval(showAge, 500);
 every(1000, new AbortController().signal, async () => tell(await askJson("/api/state")));

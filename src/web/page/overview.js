@@ -4,6 +4,9 @@ import { bytes, count, h, number, t } from "./common.js";
 import { live } from "./live.js";
 import { parcelTable } from "./parcels.js";
 
+// The code of the reason "the archive".
+const OF_ARCHIVE = 20;
+
 export function overview(main, signal) {
   const reasons = h("ul", { class: "reasons" });
   const figures = h("dl", { class: "figures" });
@@ -24,21 +27,27 @@ export function overview(main, signal) {
   }, { signal });
 }
 
+// What is wrong with the archive, in words.
+function archiveDetails({ fault, damaged, entries_lost: lost }) {
+  const details = [];
+  if (fault !== null) details.push(t("archive.fault", { fault }));
+  if (damaged !== null) details.push(t("archive.damaged", { name: damaged }));
+  if (lost > 0) details.push(t("archive.lost", { lost: count(lost) }));
+  return details;
+}
+
 function explained(state) {
+  const details = archiveDetails(state.archive);
   const items = [];
   const told = new Set();
   for (const lamp of [...state.lamps].reverse()) {
     for (const code of lamp.reasons.filter((code) => !told.has(code))) {
       told.add(code);
-      items.push(h("li", { class: lamp.on ? lamp.name : "" }, h("b", {}, t(`reason.${code}`)), h("span", {}, t(`remedy.${code}`))));
+      items.push(h("li", { class: lamp.on ? lamp.name : "" }, h("b", {}, t(`reason.${code}`)), h("span", {}, [t(`remedy.${code}`), ...(code === OF_ARCHIVE ? details : [])].join(" "))));
     }
   }
-  if (state.archive.fault !== null) {
-    told.add("archive");
-    items.push(h("li", { class: "maintenance" }, h("b", {}, t("archive.fault")), h("span", {}, `${state.archive.fault}. ${t("archive.remedy")}`)));
-  }
   if (items.length === 0) items.push(h("li", { class: "running" }, h("b", {}, t("reason.0")), h("span", {}, t("remedy.0"))));
-  return { key: `${[...told].join()} ${state.archive.fault} ${document.documentElement.lang}`, items };
+  return { key: `${[...told].join()} ${details.join()} ${document.documentElement.lang}`, items };
 }
 
 function figuresOf(state) {

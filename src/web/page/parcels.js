@@ -1,6 +1,6 @@
 // Parcels: the last ones from the machine's memory, older ones from the archive.
 
-import { askJson, every, h, number, svg, t, time } from "./common.js";
+import { askJson, every, h, has, number, svg, t, time } from "./common.js";
 
 const KEPT = 200;
 const FILTERS = {
@@ -152,12 +152,18 @@ function open(parcel, place) {
   dialog.showModal();
 }
 
+// Why there is no picture; entries of an earlier version do not say.
+function noPicture({ no_picture: why }) {
+  const key = `no_picture.${why}`;
+  return has(key) ? t(key) : t("parcel.no_picture");
+}
+
 function details(parcel, place) {
   const figure = (key, value, unit, digits) => h("div", {}, h("dt", {}, t(`parcel.${key}`)), h("dd", {}, `${number(value, digits)} ${unit}`));
   const sized = (key) => h("div", {}, h("dt", {}, t(`parcel.${key}`)), h("dd", {}, `${number(parcel[`${key}_mm`])} ± ${number(parcel[`sigma_${key}_mm`], 2)} mm`));
   return [
     h("div", { class: "bar" }, h("h2", { id: "dialog-title" }, t("parcel.title", { seq: parcel.seq })), verdict(parcel)),
-    parcel.picture ? h("p", {}, picture(parcel, picturePath(place), true)) : h("p", { class: "soft" }, t("parcel.no_picture")),
+    parcel.picture ? h("p", {}, picture(parcel, picturePath(place), true)) : h("p", { class: "soft" }, noPicture(parcel)),
     h("p", {}, doubts(parcel) || t("parcel.no_doubt")),
     h("dl", { class: "figures" },
       ...(parcel.not_measured === null ? ["length", "width", "height"].map(sized) : []),
