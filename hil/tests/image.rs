@@ -75,7 +75,7 @@ fn parcels_arrive_with_their_true_sizes_and_both_buses_work() {
     take(&mut plc, 6);
     true_sizes(&plc);
     assert_eq!(appliance.status("frames_torn"), 0);
-    assert!(is_well(appliance.status("reason")));
+    appliance.wait("all is well", "reason", is_well);
     appliance.wait("the controller is on the bus", "can_state", |state| state == 1);
     // As an ordinary user with four capabilities, and nothing else.
     let status =

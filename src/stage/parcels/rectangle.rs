@@ -13,10 +13,14 @@ use crate::units::BeltRect;
 
 /// Directions tried: so many peaks of the edges' directions, ...
 const DIRECTIONS: usize = 4;
-/// ... each turned by this, degrees, ...
+/// ... each turned by this, degrees, in a coarse grid, ...
 const TURNS_DEG: [f32; 5] = [-1.5, -0.75, 0.0, 0.75, 1.5];
-/// ... and the best by this once more.
-const FINE_TURNS_DEG: [f32; 4] = [-0.5, -0.25, 0.25, 0.5];
+/// ... whose cells are this many of the fine one's, ...
+const COARSE: f32 = 2.0;
+/// ... and the best of each by this in the fine grid, ...
+const FINE_TURNS_DEG: [f32; 5] = [-0.5, -0.25, 0.0, 0.25, 0.5];
+/// ... within this many coarse cells around it.
+const CROP_CELLS: f32 = 3.0;
 /// Around a known direction it is turned by this.
 const NEAR_TURNS_DEG: [f32; 3] = [-0.4, 0.0, 0.4];
 /// Peaks of direction are this far apart, half degrees.
@@ -75,6 +79,16 @@ impl Rectangle {
         (along.abs() - 0.5 * self.length_mm).max(across.abs() - 0.5 * self.width_mm)
     }
 
+    /// Its corners: X less travel, Y, mm.
+    fn corners_mm(&self) -> [[f32; 2]; 4] {
+        let (sin, cos) = self.yaw.sin_cos();
+        [(0.5, 0.5), (0.5, -0.5), (-0.5, -0.5), (-0.5, 0.5)].map(|(a, b)| {
+            let (along, across) = (a * self.length_mm, b * self.width_mm);
+            let x_mm = self.x_mm + cos * along - sin * across;
+            [x_mm as f32, (self.y_mm + sin * along + cos * across) as f32]
+        })
+    }
+
     /// The lowest X less travel that it reaches: its trailing end.
     pub fn trailing_mm(&self) -> f64 {
         self.x_mm - self.reach_mm()
@@ -116,6 +130,11 @@ pub struct RectangleSearch {
     /// Sums down the columns and along the rows: from [`WHOLE`] for an edge to -[`WHOLE`] for none.
     down: Block<i32>,
     along: Block<i32>,
+    /// Of each column and each row the largest rise of its sums.
+    column_stretch: Block<i32>,
+    row_stretch: Block<i32>,
+    /// Of each column the lowest of its sums so far.
+    lowest: Block<i32>,
 }
 
 /// What no view sees, or only beside a thing that stands still, tells nothing.
@@ -154,12 +173,21 @@ impl RectangleSearch {
         plan.add::<[u8; 2]>("rectangle.grid", n, "edge pixels along a direction");
         plan.add::<i32>("rectangle.down", n, "their sums down the columns");
         plan.add::<i32>("rectangle.along", n, "their sums along the rows");
+        let side = Self::side_max(zone);
+        plan.add::<i32>("rectangle.column_stretch", side, "longest stretch of each column");
+        plan.add::<i32>("rectangle.row_stretch", side, "longest stretch of each row");
+        plan.add::<i32>("rectangle.lowest", side, "lowest sum of each column");
+    }
+
+    /// Columns or rows at most, whatever the direction.
+    fn side_max(zone: &BeltRect) -> usize {
+        let count = |mm: f64| (mm.min(WINDOW_MAX_MM) / GRID_MM).ceil() as usize;
+        let (columns, rows) = (count(WINDOW_MAX_MM), count(zone.y_max_mm - zone.y_min_mm));
+        columns + rows + 2 * usize::from(MARGIN)
     }
 
     fn cells_max(zone: &BeltRect) -> usize {
-        let count = |mm: f64| (mm.min(WINDOW_MAX_MM) / GRID_MM).ceil() as usize;
-        let (columns, rows) = (count(WINDOW_MAX_MM), count(zone.y_max_mm - zone.y_min_mm));
-        let side = columns + rows + 2 * usize::from(MARGIN);
+        let side = Self::side_max(zone);
         side * side / 2 + 10 * side + 49
     }
 
@@ -169,42 +197,52 @@ impl RectangleSearch {
             grid: memory.take("rectangle.grid", [0; 2])?,
             down: memory.take("rectangle.down", 0)?,
             along: memory.take("rectangle.along", 0)?,
+            column_stretch: memory.take("rectangle.column_stretch", 0)?,
+            row_stretch: memory.take("rectangle.row_stretch", 0)?,
+            lowest: memory.take("rectangle.lowest", 0)?,
         })
     }
 
-    /// The best rectangle around a point (X less travel, Y, mm).
+    /// The best rectangle around a point (X less travel, Y, mm): of each direction the best in a coarse grid, then
+    /// the best around these in the fine one.
     pub fn best(&mut self, stack: &Stack, inside_mm: [f32; 2]) -> Option<Rectangle> {
-        let mut best: Option<Rectangle> = None;
-        let mut offer = |found: Option<Rectangle>| {
-            if let Some(found) = found
-                && best.is_none_or(|best| found.score_mm > best.score_mm)
-            {
-                best = Some(found);
-            }
-            best
-        };
-        for direction in directions(stack, inside_mm).into_iter().flatten() {
-            for turn in TURNS_DEG {
-                offer(self.best_at(stack, inside_mm, direction + turn.to_radians()));
-            }
-        }
-        let coarse = offer(None)?;
-        for turn in FINE_TURNS_DEG {
-            offer(self.best_at(stack, inside_mm, coarse.yaw as f32 + turn.to_radians()));
-        }
-        best
+        let fine_mm = grid_mm(stack);
+        let directions = directions(stack, inside_mm).map(|direction| {
+            let turned = TURNS_DEG.iter().filter_map(|turn| {
+                let yaw = direction? + turn.to_radians();
+                self.best_at(stack, inside_mm, yaw, COARSE * fine_mm, None)
+            });
+            best_of(turned)
+        });
+        let fine = directions.into_iter().flatten().filter_map(|coarse| {
+            let turned = FINE_TURNS_DEG.iter().filter_map(|turn| {
+                let yaw = coarse.yaw as f32 + turn.to_radians();
+                self.best_at(stack, inside_mm, yaw, fine_mm, Some(&coarse))
+            });
+            best_of(turned)
+        });
+        best_of(fine)
     }
 
     /// The best rectangle around a point whose direction is known to a degree.
     pub fn near(&mut self, stack: &Stack, inside_mm: [f32; 2], yaw: f32) -> Option<Rectangle> {
-        let turned = NEAR_TURNS_DEG
-            .into_iter()
-            .filter_map(|turn| self.best_at(stack, inside_mm, yaw + turn.to_radians()));
-        turned.max_by(|a, b| a.score_mm.total_cmp(&b.score_mm))
+        let fine_mm = grid_mm(stack);
+        let turned = NEAR_TURNS_DEG.into_iter().filter_map(|turn| {
+            self.best_at(stack, inside_mm, yaw + turn.to_radians(), fine_mm, None)
+        });
+        best_of(turned)
     }
 
-    fn best_at(&mut self, stack: &Stack, inside_mm: [f32; 2], yaw: f32) -> Option<Rectangle> {
-        let turned = self.turn(stack, yaw)?;
+    /// The best rectangle of one direction, in a grid with cells of `cell_mm`; `around`: not far from this one.
+    fn best_at(
+        &mut self,
+        stack: &Stack,
+        inside_mm: [f32; 2],
+        yaw: f32,
+        cell_mm: f32,
+        around: Option<&Rectangle>,
+    ) -> Option<Rectangle> {
+        let turned = self.turn(stack, yaw, cell_mm, around)?;
         self.sum_up(&turned);
         let (columns, rows) = (turned.columns, turned.rows);
         let (column, row) = turned.cell(inside_mm[0], inside_mm[1]);
@@ -212,8 +250,8 @@ impl RectangleSearch {
         let (mut low, mut high) = ([0usize; LINES], [0usize; LINES]);
         let down = |c: usize, r: usize| self.down[r * columns + c];
         let along = |c: usize, r: usize| self.along[r * columns + c];
-        let stretch_down = |c: usize| longest_stretch((0..rows).map(|r| down(c, r)));
-        let stretch_along = |r: usize| longest_stretch((0..columns).map(|c| along(c, r)));
+        let stretch_down = |c: usize| self.column_stretch[c];
+        let stretch_along = |r: usize| self.row_stretch[r];
         let lefts = lines(0..column.min(columns), stretch_down, &mut left);
         let rights = lines(column + 1..columns, stretch_down, &mut right);
         let lows = lines(0..row.min(rows), stretch_along, &mut low);
@@ -275,7 +313,7 @@ impl RectangleSearch {
     /// of two lines one may be a shadow's, and the fit must tell.
     pub fn narrower(&mut self, stack: &Stack, outer: &Rectangle) -> [Option<Rectangle>; 4] {
         let yaw = outer.yaw as f32;
-        let Some(turned) = self.turn(stack, yaw) else { return [None; 4] };
+        let Some(turned) = self.turn(stack, yaw, grid_mm(stack), None) else { return [None; 4] };
         let px_mm = f64::from(turned.px_mm);
         let (column, row) = turned.cell(outer.x_mm as f32, outer.y_mm as f32);
         let half = |length_mm: f64| (0.5 * length_mm / px_mm).round() as usize;
@@ -302,50 +340,59 @@ impl RectangleSearch {
         })
     }
 
-    /// The edge pixels in a grid turned by `yaw`, each as wide as two pixels across its side.
-    fn turn(&mut self, stack: &Stack, yaw: f32) -> Option<Turned> {
+    /// The edge pixels in a grid turned by `yaw`, each as wide as two pixels across its side; `around`: of this
+    /// rectangle's surroundings alone.
+    fn turn(
+        &mut self,
+        stack: &Stack,
+        yaw: f32,
+        px_mm: f32,
+        around: Option<&Rectangle>,
+    ) -> Option<Turned> {
         let (sin, cos) = yaw.sin_cos();
-        let px_mm = grid_mm(stack) as f32;
-        let [mut low, mut high] = [[f32::INFINITY; 2], [f32::NEG_INFINITY; 2]];
-        for edge in stack.edges() {
-            let [x, y] = edge.at_mm;
-            let at = [cos * x + sin * y, cos * y - sin * x];
-            for k in 0..2 {
-                low[k] = low[k].min(at[k]);
-                high[k] = high[k].max(at[k]);
+        let along_across = |[x, y]: [f32; 2]| [cos * x + sin * y, cos * y - sin * x];
+        let [low, high] = match around {
+            None => extent(stack.edges().iter().map(|edge| along_across(edge.at_mm)))?,
+            Some(rectangle) => {
+                let margin = CROP_CELLS * COARSE * px_mm;
+                let [low, high] = extent(rectangle.corners_mm().map(along_across).into_iter())?;
+                [low.map(|mm| mm - margin), high.map(|mm| mm + margin)]
             }
-        }
+        };
         let margin = f32::from(MARGIN);
         let count = |k: usize| ((high[k] - low[k]) / px_mm + 2.0 * margin + 1.0) as usize;
-        if stack.edges().is_empty() {
-            return None;
-        }
         let origin = low.map(|low| low - margin * px_mm);
         let turned = Turned { sin, cos, origin, columns: count(0), rows: count(1), px_mm };
-        let (columns, n) = (turned.columns, turned.columns * turned.rows);
-        if n > self.grid.len() {
+        let (columns, rows) = (turned.columns, turned.rows);
+        if columns * rows > self.grid.len() || columns.max(rows) > self.row_stretch.len() {
             return None;
         }
-        for row in 0..turned.rows {
-            for column in 0..columns {
-                let (x, y) = turned.point(column as f32, row as f32);
-                let value = if stack.is_seen(x, y) { 0 } else { UNSEEN };
-                self.grid[row * columns + column] = [value; 2];
+        let seen = stack.seen();
+        for (row, line) in self.grid[..columns * rows].chunks_exact_mut(columns).enumerate() {
+            let from = turned.point(0.0, row as f32);
+            let step = [cos * px_mm, sin * px_mm];
+            for (column, cell) in line.iter_mut().enumerate() {
+                let x = from.0 + column as f32 * step[0];
+                let y = from.1 + column as f32 * step[1];
+                *cell = [if seen.at(x, y) { 0 } else { UNSEEN }; 2];
             }
         }
+        // A pixel to each side, too: turned pixels leave holes.
+        let wide = grid_mm(stack) / px_mm;
+        let grid = &mut self.grid[..columns * rows];
         for edge in stack.edges() {
-            let [x, y] = edge.at_mm;
-            let (column, row) = turned.cell(x, y);
-            let i = row * columns + column;
-            let across = cos * edge.step[0] + sin * edge.step[1];
-            let up = cos * edge.step[1] - sin * edge.step[0];
+            let [along, across] = along_across(edge.at_mm);
+            let [u, v] = [(along - origin[0]) / px_mm + 0.5, (across - origin[1]) / px_mm + 0.5];
+            let inside = u >= margin && v >= margin;
+            if !inside || u >= columns as f32 - margin || v >= rows as f32 - margin {
+                continue;
+            }
+            let steps = along_across(edge.step);
             let value = (edge.agreement * f32::from(WHOLE)).round() as u8;
-            // A pixel along the side, too: turned pixels leave holes.
-            for (k, _) in
-                [across, up].iter().enumerate().filter(|(_, step)| step.abs() > ACROSS_MIN)
-            {
-                for i in [i - columns, i - 1, i, i + 1, i + columns] {
-                    let cell = &mut self.grid[i][k];
+            for k in (0..2).filter(|&k| steps[k].abs() > ACROSS_MIN) {
+                let cells = [(u, v), (u - wide, v), (u + wide, v), (u, v - wide), (u, v + wide)];
+                for (u, v) in cells {
+                    let cell = &mut grid[v as usize * columns + u as usize][k];
                     *cell = if *cell == UNSEEN { UNSEEN } else { value.max(*cell) };
                 }
             }
@@ -354,27 +401,71 @@ impl RectangleSearch {
     }
 
     fn sum_up(&mut self, turned: &Turned) {
-        let columns = turned.columns;
-        let value = |edge: u8| match edge {
-            UNSEEN => 0,
-            edge => 2 * i32::from(edge) - i32::from(WHOLE),
-        };
-        for row in 0..turned.rows {
-            let mut sum = 0;
-            for column in 0..columns {
-                let i = row * columns + column;
-                sum += value(self.grid[i][1]);
-                self.along[i] = sum;
-                let above = if row > 0 { self.down[i - columns] } else { 0 };
-                self.down[i] = above + value(self.grid[i][0]);
+        let (columns, rows) = (turned.columns, turned.rows);
+        let grid = &self.grid[..columns * rows];
+        let (down, along) = (&mut self.down[..columns * rows], &mut self.along[..columns * rows]);
+        let (lowest, most) = (&mut self.lowest[..columns], &mut self.column_stretch[..columns]);
+        lowest.fill(0);
+        most.fill(0);
+        for row in 0..rows {
+            let here = row * columns..(row + 1) * columns;
+            let mut rise = Rise::default();
+            for (cell, sum) in grid[here.clone()].iter().zip(&mut along[here.clone()]) {
+                *sum = rise.add(worth(cell[1]));
+            }
+            self.row_stretch[row] = rise.most;
+            let (before, down) = down.split_at_mut(here.start);
+            let above = before.len().checked_sub(columns).map(|from| &before[from..]);
+            for (column, cell) in grid[here].iter().enumerate() {
+                let sum = above.map_or(0, |above| above[column]) + worth(cell[0]);
+                down[column] = sum;
+                most[column] = most[column].max(sum - lowest[column]);
+                lowest[column] = lowest[column].min(sum);
             }
         }
     }
 }
 
+/// What a cell counts for: from [`WHOLE`] for an edge to -[`WHOLE`] for none.
+fn worth(edge: u8) -> i32 {
+    if edge == UNSEEN { 0 } else { 2 * i32::from(edge) - i32::from(WHOLE) }
+}
+
+/// A running sum, and its largest rise.
+#[derive(Default)]
+struct Rise {
+    sum: i32,
+    lowest: i32,
+    most: i32,
+}
+
+impl Rise {
+    fn add(&mut self, value: i32) -> i32 {
+        self.sum += value;
+        self.most = self.most.max(self.sum - self.lowest);
+        self.lowest = self.lowest.min(self.sum);
+        self.sum
+    }
+}
+
+/// The lowest and the highest coordinates of points.
+fn extent(points: impl Iterator<Item = [f32; 2]>) -> Option<[[f32; 2]; 2]> {
+    points.fold(None, |extent, point| {
+        let [low, high] = extent.unwrap_or([point; 2]);
+        Some([
+            std::array::from_fn(|k| low[k].min(point[k])),
+            std::array::from_fn(|k| high[k].max(point[k])),
+        ])
+    })
+}
+
+fn best_of(rectangles: impl Iterator<Item = Rectangle>) -> Option<Rectangle> {
+    rectangles.max_by(|a, b| a.score_mm.total_cmp(&b.score_mm))
+}
+
 /// Side of the grid's cells, mm: [`GRID_MM`], or a pixel of the stack.
-fn grid_mm(stack: &Stack) -> f64 {
-    stack.px_mm().max(GRID_MM)
+fn grid_mm(stack: &Stack) -> f32 {
+    stack.px_mm().max(GRID_MM) as f32
 }
 
 /// Pixels around the edges in the turned grid.
@@ -419,16 +510,6 @@ fn share(side: impl Iterator<Item = u8>) -> f64 {
         }
     }
     f64::from(edge) / f64::from((u32::from(WHOLE) * seen.max(all / 2)).max(1))
-}
-
-/// The largest rise within running sums.
-fn longest_stretch(sums: impl Iterator<Item = i32>) -> i32 {
-    let (mut lowest, mut most) = (0, 0);
-    for sum in sums {
-        most = most.max(sum - lowest);
-        lowest = lowest.min(sum);
-    }
-    most
 }
 
 /// The lines of longest stretches, no two side by side; as many as there is room for.

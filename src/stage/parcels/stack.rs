@@ -134,16 +134,14 @@ impl Stack {
         &self.edges[..self.edge_count]
     }
 
-    /// Whether enough views see a point of the window.
-    pub fn is_seen(&self, x_mm: f32, y_mm: f32) -> bool {
-        let column = (x_mm - self.origin_mm[0] as f32) / self.px_mm as f32 + 0.5;
-        let row = (self.origin_mm[1] as f32 - y_mm) / self.px_mm as f32 + 0.5;
-        let inside = column >= 0.0 && row >= 0.0;
-        let (column, row) = (column as usize, row as usize);
-        inside
-            && column < self.columns
-            && row < self.rows
-            && self.views[row * self.columns + column] >= VIEWS_MIN
+    /// Which points of the window enough views see.
+    pub fn seen(&self) -> Seen<'_> {
+        Seen {
+            views: &self.views[..self.columns * self.rows],
+            size: [self.columns, self.rows],
+            per_mm: (1.0 / self.px_mm) as f32,
+            origin_mm: self.origin_mm.map(|mm| mm as f32),
+        }
     }
 
     /// Stack the views on a window, cut to the zone's width and to what there is memory for. `usable`: of a
@@ -285,6 +283,28 @@ impl Stack {
             noise.reverse();
         }
         noise.map(|noise| if noise.is_nan() { 0.0 } else { noise })
+    }
+}
+
+/// Which points of a window enough views see.
+pub struct Seen<'a> {
+    views: &'a [u16],
+    size: [usize; 2],
+    per_mm: f32,
+    origin_mm: [f32; 2],
+}
+
+impl Seen<'_> {
+    /// Whether enough views see a point: X less travel, Y, mm.
+    pub fn at(&self, x_mm: f32, y_mm: f32) -> bool {
+        let column = (x_mm - self.origin_mm[0]) * self.per_mm + 0.5;
+        let row = (self.origin_mm[1] - y_mm) * self.per_mm + 0.5;
+        let [columns, rows] = self.size;
+        column >= 0.0
+            && row >= 0.0
+            && (column as usize) < columns
+            && (row as usize) < rows
+            && self.views[row as usize * columns + column as usize] >= VIEWS_MIN
     }
 }
 
