@@ -360,11 +360,19 @@ impl Parcels {
             let found = self.search.best(&self.stack, inside_mm.map(|mm| mm as f32));
             let score_mm = best.map_or(0.0, |best| best.score_mm + GRID_MM);
             let Some(found) = found.filter(|found| found.score_mm > score_mm) else { break };
+            best = Some(found);
+            let near = border_of(&found, NEAR_MM);
+            if near
+                .iter()
+                .zip(window)
+                .all(|(near, window)| near[0] >= window[0] && near[1] <= window[1])
+            {
+                break;
+            }
             // What the window cut off may be seen from there.
             for ([low, high], [from, to]) in around.iter_mut().zip(border_of(&found, 0.0)) {
                 (*low, *high) = (low.min(from), high.max(to));
             }
-            best = Some(found);
         }
         best
     }
