@@ -17,9 +17,9 @@ use crate::camera::BeltView;
 use crate::error::Result;
 use crate::plan::{Memory, Plan};
 use crate::units::BeltRect;
-use rectangle::{GRID_MM, RectangleSearch};
+use rectangle::{CROP_MM, GRID_MM, RectangleSearch};
 use stack::{Stack, WINDOW_MAX_MM, Window};
-use steps::Steps;
+use steps::{Scale, Steps};
 use still::Still;
 
 pub use rectangle::Rectangle;
@@ -52,6 +52,8 @@ const ACCIDENT_SUPPORT: f64 = 0.55;
 const HEIGHT_OFFSETS_MM: [&[f64]; 2] = [&[-5.0, 5.0, -10.0, 10.0, -15.0, 15.0], &[-2.5, 2.5]];
 /// Times that the border is sought anew on the plane where it was sharpest.
 const LOOKS: usize = 2;
+/// Rectangles found in coarse pictures that are looked at in fine ones: a beginning's two best directions.
+const CANDIDATES: usize = 2;
 /// What is looked at around a known border, mm.
 const NEAR_MM: f64 = 40.0;
 /// Cells this far around a face are its own: its sides, mm.
@@ -78,6 +80,38 @@ pub struct Face {
     pub stacked: bool,
 }
 
+/// The views of a pass at one scale, and what of them is looked at.
+struct Layer {
+    steps: Steps,
+    still: Still,
+    stack: Stack,
+}
+
+impl Layer {
+    fn plan(view: &BeltView, scale: Scale, zone: &BeltRect, height_max_mm: f64, plan: &mut Plan) {
+        Steps::plan(view, scale, plan);
+        Still::plan(view, scale, plan);
+        Stack::plan(view, scale, zone, height_max_mm, plan);
+    }
+
+    fn new(view: &BeltView, scale: Scale, zone: &BeltRect, memory: &mut Memory) -> Result<Self> {
+        let steps = Steps::new(view, scale, memory)?;
+        let still = Still::new(view, scale, memory)?;
+        Ok(Self { steps, still, stack: Stack::new(view, scale, zone, memory)? })
+    }
+
+    fn add(&mut self, views: &Views, place: usize, seen: &[u64]) {
+        self.steps.add(views.grey(place), seen, place);
+        self.still.add(self.steps.picture(place).grey);
+    }
+
+    /// Stack the views on a window at a height: x and y, lowest and highest, mm.
+    fn fill(&mut self, views: &Views, height_mm: f64, [x_mm, y_mm]: [[f64; 2]; 2]) {
+        let window = Window { height_mm, x_mm, y_mm };
+        self.stack.fill(views, &self.steps, self.still.usable(), &window);
+    }
+}
+
 /// The undecided part of the scroll.
 pub struct Parcels {
     /// First column that is looked at, and its cells and whether they are free.
@@ -88,9 +122,8 @@ pub struct Parcels {
     cell_mm: f64,
     row_0_mm: f64,
     height_max_mm: f32,
-    steps: Steps,
-    still: Still,
-    stack: Stack,
+    fine: Layer,
+    coarse: Layer,
     search: RectangleSearch,
     /// Faces found, not yet passed on.
     waiting: Vec<Face>,
@@ -101,9 +134,8 @@ pub struct Parcels {
 impl Parcels {
     /// Memory for a site.
     pub fn plan(view: &BeltView, zone: &BeltRect, height_max_mm: f64, plan: &mut Plan) {
-        Steps::plan(view, plan);
-        Still::plan(view, plan);
-        Stack::plan(view, zone, height_max_mm, plan);
+        Layer::plan(view, Scale::Fine, zone, height_max_mm, plan);
+        Layer::plan(view, Scale::Coarse, zone, height_max_mm, plan);
         RectangleSearch::plan(zone, plan);
     }
 
@@ -123,9 +155,8 @@ impl Parcels {
             cell_mm: evidence.side_mm(),
             row_0_mm: evidence.row_mm(0),
             height_max_mm: height_max_mm as f32,
-            steps: Steps::new(view, memory)?,
-            still: Still::new(view, memory)?,
-            stack: Stack::new(view, zone, memory)?,
+            fine: Layer::new(view, Scale::Fine, zone, memory)?,
+            coarse: Layer::new(view, Scale::Coarse, zone, memory)?,
             search: RectangleSearch::new(memory)?,
             waiting: Vec::new(),
             gone: Vec::new(),
@@ -134,8 +165,8 @@ impl Parcels {
 
     /// A view more. `seen`: bit mask of the view's pixels that the camera sees.
     pub fn add(&mut self, views: &Views, place: usize, seen: &[u64]) {
-        self.steps.add(views.grey(place), seen, place);
-        self.still.add(self.steps.picture(place).grey);
+        self.fine.add(views, place, seen);
+        self.coarse.add(views, place, seen);
     }
 
     /// The faces whose trailing end has passed `end_mm`, X less the belt's travel. `is_raised`: whether a face
@@ -308,8 +339,8 @@ impl Parcels {
                 None => break,
             }
         }
-        self.fill(views, top_mm, border_of(&best, NEAR_MM));
-        let narrower = self.search.narrower(&self.stack, &best);
+        self.fine.fill(views, top_mm, border_of(&best, NEAR_MM));
+        let narrower = self.search.narrower(&self.fine.stack, &best);
         let weakest = best.sides.iter().copied().fold(1.0, f64::min);
         let is_face = best.support() >= SUPPORT_MIN && weakest >= SIDE_SUPPORT_MIN;
         is_face.then_some(Face {
@@ -331,9 +362,9 @@ impl Parcels {
                 if !(f64::from(HEIGHT_MIN_MM)..f64::from(self.height_max_mm)).contains(&trial_mm) {
                     continue;
                 }
-                self.fill(views, trial_mm, border_of(&best, NEAR_MM));
+                self.fine.fill(views, trial_mm, border_of(&best, NEAR_MM));
                 let middle = [best.x_mm as f32, best.y_mm as f32];
-                let found = self.search.near(&self.stack, middle, best.yaw as f32);
+                let found = self.search.near(&self.fine.stack, middle, best.yaw as f32);
                 if let Some(found) = found.filter(|found| found.score_mm > best.score_mm) {
                     (best, top_mm) = (found, trial_mm);
                 }
@@ -356,8 +387,14 @@ impl Parcels {
                 let reach_mm = (0.5 * (WINDOW_MAX_MM - (high - low))).clamp(NEAR_MM, REACH_MM);
                 [low - reach_mm, high + reach_mm]
             });
-            self.fill(views, height_mm, window);
-            let found = self.search.best(&self.stack, inside_mm.map(|mm| mm as f32));
+            self.coarse.fill(views, height_mm, window);
+            let inside = inside_mm.map(|mm| mm as f32);
+            let candidates = self.search.candidates(&self.coarse.stack, inside);
+            let refined = candidates.iter().take(CANDIDATES).filter_map(|coarse| {
+                self.fine.fill(views, height_mm, border_of(coarse, CROP_MM));
+                self.search.refined(&self.fine.stack, inside, coarse)
+            });
+            let found = refined.max_by(|a, b| a.score_mm.total_cmp(&b.score_mm));
             let score_mm = best.map_or(0.0, |best| best.score_mm + GRID_MM);
             let Some(found) = found.filter(|found| found.score_mm > score_mm) else { break };
             best = Some(found);
@@ -375,11 +412,6 @@ impl Parcels {
             }
         }
         best
-    }
-
-    fn fill(&mut self, views: &Views, height_mm: f64, [x_mm, y_mm]: [[f64; 2]; 2]) {
-        let window = Window { height_mm, x_mm, y_mm };
-        self.stack.fill(views, &self.steps, self.still.usable(), &window);
     }
 
     /// The cells of a face are free no more.

@@ -13,14 +13,12 @@ use crate::units::BeltRect;
 
 /// Directions tried: so many peaks of the edges' directions, ...
 const DIRECTIONS: usize = 4;
-/// ... each turned by this, degrees, in a coarse grid, ...
+/// ... each turned by this, degrees, in coarse pictures, ...
 const TURNS_DEG: [f32; 5] = [-1.5, -0.75, 0.0, 0.75, 1.5];
-/// ... whose cells are this many of the fine one's, ...
-const COARSE: f32 = 2.0;
-/// ... and the best of each by this in the fine grid, ...
+/// ... and what is found by this in fine ones, ...
 const FINE_TURNS_DEG: [f32; 5] = [-0.5, -0.25, 0.0, 0.25, 0.5];
-/// ... within this many coarse cells around it.
-const CROP_CELLS: f32 = 3.0;
+/// ... so far around it, mm: three coarse pixels.
+pub const CROP_MM: f64 = 12.0;
 /// Around a known direction it is turned by this.
 const NEAR_TURNS_DEG: [f32; 3] = [-0.4, 0.0, 0.4];
 /// Peaks of direction are this far apart, half degrees.
@@ -203,46 +201,55 @@ impl RectangleSearch {
         })
     }
 
-    /// The best rectangle around a point (X less travel, Y, mm): of each direction the best in a coarse grid, then
-    /// the best around these in the fine one.
-    pub fn best(&mut self, stack: &Stack, inside_mm: [f32; 2]) -> Option<Rectangle> {
-        let fine_mm = grid_mm(stack);
+    /// The best rectangle around a point (X less travel, Y, mm) in each of the most promising directions, best first,
+    /// by a stack of coarse pictures.
+    pub fn candidates(
+        &mut self,
+        stack: &Stack,
+        inside_mm: [f32; 2],
+    ) -> heapless::Vec<Rectangle, DIRECTIONS> {
         let directions = directions(stack, inside_mm).map(|direction| {
             let turned = TURNS_DEG.iter().filter_map(|turn| {
-                let yaw = direction? + turn.to_radians();
-                self.best_at(stack, inside_mm, yaw, COARSE * fine_mm, None)
+                self.best_at(stack, inside_mm, direction? + turn.to_radians(), None)
             });
             best_of(turned)
         });
-        let fine = directions.into_iter().flatten().filter_map(|coarse| {
-            let turned = FINE_TURNS_DEG.iter().filter_map(|turn| {
-                let yaw = coarse.yaw as f32 + turn.to_radians();
-                self.best_at(stack, inside_mm, yaw, fine_mm, Some(&coarse))
-            });
-            best_of(turned)
-        });
-        best_of(fine)
+        let mut found: heapless::Vec<_, DIRECTIONS> = directions.into_iter().flatten().collect();
+        found.sort_unstable_by(|a, b| b.score_mm.total_cmp(&a.score_mm));
+        found
     }
 
-    /// The best rectangle around a point whose direction is known to a degree.
-    pub fn near(&mut self, stack: &Stack, inside_mm: [f32; 2], yaw: f32) -> Option<Rectangle> {
-        let fine_mm = grid_mm(stack);
-        let turned = NEAR_TURNS_DEG.into_iter().filter_map(|turn| {
-            self.best_at(stack, inside_mm, yaw + turn.to_radians(), fine_mm, None)
+    /// The best rectangle around a point and near one that was found in coarse pictures.
+    pub fn refined(
+        &mut self,
+        stack: &Stack,
+        inside_mm: [f32; 2],
+        coarse: &Rectangle,
+    ) -> Option<Rectangle> {
+        let turned = FINE_TURNS_DEG.iter().filter_map(|turn| {
+            let yaw = coarse.yaw as f32 + turn.to_radians();
+            self.best_at(stack, inside_mm, yaw, Some(coarse))
         });
         best_of(turned)
     }
 
-    /// The best rectangle of one direction, in a grid with cells of `cell_mm`; `around`: not far from this one.
+    /// The best rectangle around a point whose direction is known to a degree.
+    pub fn near(&mut self, stack: &Stack, inside_mm: [f32; 2], yaw: f32) -> Option<Rectangle> {
+        let turned = NEAR_TURNS_DEG
+            .into_iter()
+            .filter_map(|turn| self.best_at(stack, inside_mm, yaw + turn.to_radians(), None));
+        best_of(turned)
+    }
+
+    /// The best rectangle of one direction; `around`: not far from this one.
     fn best_at(
         &mut self,
         stack: &Stack,
         inside_mm: [f32; 2],
         yaw: f32,
-        cell_mm: f32,
         around: Option<&Rectangle>,
     ) -> Option<Rectangle> {
-        let turned = self.turn(stack, yaw, cell_mm, around)?;
+        let turned = self.turn(stack, yaw, around)?;
         self.sum_up(&turned);
         let (columns, rows) = (turned.columns, turned.rows);
         let (column, row) = turned.cell(inside_mm[0], inside_mm[1]);
@@ -313,7 +320,7 @@ impl RectangleSearch {
     /// of two lines one may be a shadow's, and the fit must tell.
     pub fn narrower(&mut self, stack: &Stack, outer: &Rectangle) -> [Option<Rectangle>; 4] {
         let yaw = outer.yaw as f32;
-        let Some(turned) = self.turn(stack, yaw, grid_mm(stack), None) else { return [None; 4] };
+        let Some(turned) = self.turn(stack, yaw, None) else { return [None; 4] };
         let px_mm = f64::from(turned.px_mm);
         let (column, row) = turned.cell(outer.x_mm as f32, outer.y_mm as f32);
         let half = |length_mm: f64| (0.5 * length_mm / px_mm).round() as usize;
@@ -342,19 +349,14 @@ impl RectangleSearch {
 
     /// The edge pixels in a grid turned by `yaw`, each as wide as two pixels across its side; `around`: of this
     /// rectangle's surroundings alone.
-    fn turn(
-        &mut self,
-        stack: &Stack,
-        yaw: f32,
-        px_mm: f32,
-        around: Option<&Rectangle>,
-    ) -> Option<Turned> {
+    fn turn(&mut self, stack: &Stack, yaw: f32, around: Option<&Rectangle>) -> Option<Turned> {
         let (sin, cos) = yaw.sin_cos();
+        let px_mm = grid_mm(stack);
         let along_across = |[x, y]: [f32; 2]| [cos * x + sin * y, cos * y - sin * x];
         let [low, high] = match around {
             None => extent(stack.edges().iter().map(|edge| along_across(edge.at_mm)))?,
             Some(rectangle) => {
-                let margin = CROP_CELLS * COARSE * px_mm;
+                let margin = CROP_MM as f32;
                 let [low, high] = extent(rectangle.corners_mm().map(along_across).into_iter())?;
                 [low.map(|mm| mm - margin), high.map(|mm| mm + margin)]
             }
@@ -378,7 +380,6 @@ impl RectangleSearch {
             }
         }
         // A pixel to each side, too: turned pixels leave holes.
-        let wide = grid_mm(stack) / px_mm;
         let grid = &mut self.grid[..columns * rows];
         for edge in stack.edges() {
             let [along, across] = along_across(edge.at_mm);
@@ -390,7 +391,7 @@ impl RectangleSearch {
             let steps = along_across(edge.step);
             let value = (edge.agreement * f32::from(WHOLE)).round() as u8;
             for k in (0..2).filter(|&k| steps[k].abs() > ACROSS_MIN) {
-                let cells = [(u, v), (u - wide, v), (u + wide, v), (u, v - wide), (u, v + wide)];
+                let cells = [(u, v), (u - 1.0, v), (u + 1.0, v), (u, v - 1.0), (u, v + 1.0)];
                 for (u, v) in cells {
                     let cell = &mut grid[v as usize * columns + u as usize][k];
                     *cell = if *cell == UNSEEN { UNSEEN } else { value.max(*cell) };

@@ -5,7 +5,7 @@
 //! (semblance), beyond what noise does there, and not part of a slow ramp: a shadow's soft border is
 //! as wide as its displacement and would look alike at every height.
 
-use super::steps::{STEP_ONE, StepPicture, Steps};
+use super::steps::{STEP_ONE, Scale, StepPicture, Steps};
 use crate::camera::BeltView;
 use crate::error::Result;
 use crate::plan::{Block, Memory, Plan};
@@ -81,30 +81,46 @@ pub struct Stack {
     edge_count: usize,
 }
 
-/// Pixels of the largest window along and across, and their side on the belt, mm.
-fn sizes(view: &BeltView, zone: &BeltRect, height_max_mm: f64) -> (f64, [usize; 2]) {
-    let (side_px, _) = Steps::sizes(view);
-    let px_mm = side_px as f64 * view.mm_per_px;
-    let least_mm = px_mm / view.magnification(height_max_mm);
+/// Pixels of the largest window along and across.
+fn size_max(view: &BeltView, scale: Scale, zone: &BeltRect, height_max_mm: f64) -> [usize; 2] {
+    let (side_px, _) = scale.sizes(view);
+    let least_mm = side_px as f64 * view.mm_per_px / view.magnification(height_max_mm);
     let count = |length_mm: f64| (length_mm.min(WINDOW_MAX_MM) / least_mm).ceil() as usize;
-    (px_mm, [count(WINDOW_MAX_MM), count(zone.y_max_mm - zone.y_min_mm)])
+    [count(WINDOW_MAX_MM), count(zone.y_max_mm - zone.y_min_mm)]
 }
+
+const STEPS: [&str; 2] = ["stack.steps", "coarse_stack.steps"];
+const ENERGY: [&str; 2] = ["stack.energy", "coarse_stack.energy"];
+const GREY: [&str; 2] = ["stack.grey", "coarse_stack.grey"];
+const VIEWS: [&str; 2] = ["stack.views", "coarse_stack.views"];
+const EDGES: [&str; 2] = ["stack.edges", "coarse_stack.edges"];
 
 impl Stack {
     /// Memory for a site.
-    pub fn plan(view: &BeltView, zone: &BeltRect, height_max_mm: f64, plan: &mut Plan) {
-        let (_, [columns, rows]) = sizes(view, zone, height_max_mm);
+    pub fn plan(
+        view: &BeltView,
+        scale: Scale,
+        zone: &BeltRect,
+        height_max_mm: f64,
+        plan: &mut Plan,
+    ) {
+        let [columns, rows] = size_max(view, scale, zone, height_max_mm);
         let n = columns * rows;
-        plan.add::<[i16; 2]>("stack.steps", n, "a window's steps, summed over the views");
-        plan.add::<i32>("stack.energy", n, "their squares");
-        plan.add::<u16>("stack.grey", n, "its grey values");
-        plan.add::<u16>("stack.views", n, "how many views show it");
-        plan.add::<EdgePixel>("stack.edges", n, "edge pixels of a plane");
+        plan.add::<[i16; 2]>(scale.name(STEPS), n, "a window's steps, summed over the views");
+        plan.add::<i32>(scale.name(ENERGY), n, "their squares");
+        plan.add::<u16>(scale.name(GREY), n, "its grey values");
+        plan.add::<u16>(scale.name(VIEWS), n, "how many views show it");
+        plan.add::<EdgePixel>(scale.name(EDGES), n, "edge pixels of a plane");
     }
 
     /// Nothing stacked.
-    pub fn new(view: &BeltView, zone: &BeltRect, memory: &mut Memory) -> Result<Self> {
-        let (side_px, picture_px) = Steps::sizes(view);
+    pub fn new(
+        view: &BeltView,
+        scale: Scale,
+        zone: &BeltRect,
+        memory: &mut Memory,
+    ) -> Result<Self> {
+        let (side_px, picture_px) = scale.sizes(view);
         Ok(Self {
             geometry: view.clone(),
             zone: *zone,
@@ -115,11 +131,11 @@ impl Stack {
             rows: 0,
             origin_mm: [0.0; 2],
             log_of: std::array::from_fn(|grey| (grey as f32 + DARK_GREY).ln()),
-            steps: memory.take("stack.steps", [0; 2])?,
-            energy: memory.take("stack.energy", 0)?,
-            grey: memory.take("stack.grey", 0)?,
-            views: memory.take("stack.views", 0)?,
-            edges: memory.take("stack.edges", EdgePixel::default())?,
+            steps: memory.take(scale.name(STEPS), [0; 2])?,
+            energy: memory.take(scale.name(ENERGY), 0)?,
+            grey: memory.take(scale.name(GREY), 0)?,
+            views: memory.take(scale.name(VIEWS), 0)?,
+            edges: memory.take(scale.name(EDGES), EdgePixel::default())?,
             edge_count: 0,
         })
     }

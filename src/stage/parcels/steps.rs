@@ -12,12 +12,39 @@ use crate::plan::{Block, Memory, Plan};
 use crate::stage::evidence::DARK_GREY;
 use crate::stage::views::VIEWS_MAX;
 
-/// Side of a picture's pixel, mm, about: coarser than the fit's, finer than any gap that matters.
+/// Side of a fine picture's pixel, mm, about: coarser than the fit's, finer than any gap that matters.
 const PX_MM: f64 = 2.0;
+/// Pixels of a coarse picture are twice as wide, if that is no more than this, mm: a small parcel still has
+/// sides.
+const COARSE_PX_MAX_MM: f64 = 5.0;
 /// A step of 1 in the logarithm, in units of a stored one.
 pub const STEP_ONE: f32 = 256.0;
 /// The longest step that is stored; longer ones keep their direction.
 const STEP_MOST: f32 = 127.0;
+
+/// How large the pixels are: what is sought is found in coarse pictures and looked at in fine ones.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Scale {
+    /// About 2 mm.
+    Fine,
+    /// Twice as much.
+    Coarse,
+}
+
+impl Scale {
+    /// The name of a block of memory at this scale.
+    pub fn name(self, [fine, coarse]: [&'static str; 2]) -> &'static str {
+        if self == Self::Fine { fine } else { coarse }
+    }
+
+    /// Pixels of the view to a side of a picture's, and the picture's size.
+    pub fn sizes(self, view: &BeltView) -> (usize, [usize; 2]) {
+        let fine_px = (PX_MM / view.mm_per_px).round().max(1.0) as usize;
+        let is_twice = 2.0 * fine_px as f64 * view.mm_per_px <= COARSE_PX_MAX_MM;
+        let side_px = if self == Self::Coarse && is_twice { 2 * fine_px } else { fine_px };
+        (side_px, view.size_px.map(|px| (px / side_px).max(1)))
+    }
+}
 
 /// The steps of one view.
 #[derive(Clone, Copy)]
@@ -27,6 +54,11 @@ pub struct StepPicture<'a> {
     /// Grey values; 0: not known.
     pub grey: &'a [u8],
 }
+
+const LOG: [&str; 2] = ["steps.log", "coarse_steps.log"];
+const SLOW: [&str; 2] = ["steps.slow", "coarse_steps.slow"];
+const STEPS: [&str; 2] = ["steps.steps", "coarse_steps.steps"];
+const GREY: [&str; 2] = ["steps.grey", "coarse_steps.grey"];
 
 /// The stage.
 pub struct Steps {
@@ -42,41 +74,30 @@ pub struct Steps {
     grey: Block<u8>,
 }
 
-/// Pixels of the view to a side of a picture's, and the picture's size.
-fn sizes(view: &BeltView) -> (usize, [usize; 2]) {
-    let side_px = (PX_MM / view.mm_per_px).round().max(1.0) as usize;
-    (side_px, view.size_px.map(|px| (px / side_px).max(1)))
-}
-
 impl Steps {
     /// Memory for a view.
-    pub fn plan(view: &BeltView, plan: &mut Plan) {
-        let (_, [width, height]) = sizes(view);
+    pub fn plan(view: &BeltView, scale: Scale, plan: &mut Plan) {
+        let (_, [width, height]) = scale.sizes(view);
         let n = width * height;
-        plan.add::<f32>("steps.log", n, "logarithm of one view");
-        plan.add::<f32>("steps.slow", n, "its slow part");
-        plan.add::<[i8; 2]>("steps.steps", n * VIEWS_MAX, "steps of each view kept");
-        plan.add::<u8>("steps.grey", n * VIEWS_MAX, "grey values to them");
+        plan.add::<f32>(scale.name(LOG), n, "logarithm of one view");
+        plan.add::<f32>(scale.name(SLOW), n, "its slow part");
+        plan.add::<[i8; 2]>(scale.name(STEPS), n * VIEWS_MAX, "steps of each view kept");
+        plan.add::<u8>(scale.name(GREY), n * VIEWS_MAX, "grey values to them");
     }
 
     /// None yet.
-    pub fn new(view: &BeltView, memory: &mut Memory) -> Result<Self> {
-        let (side_px, size_px) = sizes(view);
+    pub fn new(view: &BeltView, scale: Scale, memory: &mut Memory) -> Result<Self> {
+        let (side_px, size_px) = scale.sizes(view);
         Ok(Self {
             side_px,
             view_px: view.size_px,
             size_px,
             log_of: std::array::from_fn(|grey| (grey as f32 + DARK_GREY).ln()),
-            log: memory.take("steps.log", 0.0)?,
-            slow: memory.take("steps.slow", 0.0)?,
-            steps: memory.take("steps.steps", [0; 2])?,
-            grey: memory.take("steps.grey", 0)?,
+            log: memory.take(scale.name(LOG), 0.0)?,
+            slow: memory.take(scale.name(SLOW), 0.0)?,
+            steps: memory.take(scale.name(STEPS), [0; 2])?,
+            grey: memory.take(scale.name(GREY), 0)?,
         })
-    }
-
-    /// Pixels of the view to a side of a picture's, and the picture's size.
-    pub fn sizes(view: &BeltView) -> (usize, [usize; 2]) {
-        sizes(view)
     }
 
     /// The steps of the view at a place.

@@ -5,7 +5,7 @@
 //! along. The still scene is the running median of each pixel over the views, which moves by a grey level a
 //! view: what is in the first one is forgotten after as many views as it has contrast.
 
-use super::steps::{REACH_PX, Steps};
+use super::steps::{REACH_PX, Scale};
 use crate::camera::BeltView;
 use crate::error::Result;
 use crate::plan::{Block, Memory, Plan};
@@ -14,6 +14,9 @@ use crate::plan::{Block, Memory, Plan};
 const STEP_SHARE: f32 = 0.06;
 /// ... and in grey levels: noise is none.
 const STEP_GREY: f32 = 4.0;
+
+const MEDIAN: [&str; 2] = ["still.median", "coarse_still.median"];
+const USABLE: [&str; 2] = ["still.usable", "coarse_still.usable"];
 
 /// The still scene.
 pub struct Still {
@@ -25,20 +28,20 @@ pub struct Still {
 
 impl Still {
     /// Memory for a view.
-    pub fn plan(view: &BeltView, plan: &mut Plan) {
-        let (_, [width, height]) = Steps::sizes(view);
-        plan.add::<u8>("still.median", width * height, "what stands still");
-        plan.add::<bool>("still.usable", width * height, "pixels without its edges");
+    pub fn plan(view: &BeltView, scale: Scale, plan: &mut Plan) {
+        let (_, [width, height]) = scale.sizes(view);
+        plan.add::<u8>(scale.name(MEDIAN), width * height, "what stands still");
+        plan.add::<bool>(scale.name(USABLE), width * height, "pixels without its edges");
     }
 
     /// Nothing seen.
-    pub fn new(view: &BeltView, memory: &mut Memory) -> Result<Self> {
-        let (_, size_px) = Steps::sizes(view);
+    pub fn new(view: &BeltView, scale: Scale, memory: &mut Memory) -> Result<Self> {
+        let (_, size_px) = scale.sizes(view);
         Ok(Self {
             size_px,
-            median: memory.take("still.median", 0)?,
+            median: memory.take(scale.name(MEDIAN), 0)?,
             known: false,
-            usable: memory.take("still.usable", true)?,
+            usable: memory.take(scale.name(USABLE), true)?,
         })
     }
 
