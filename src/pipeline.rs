@@ -10,6 +10,7 @@ mod records;
 mod sight;
 
 pub use motion::Health;
+pub use records::doubts;
 pub use sight::Sight;
 
 use crate::belt::BeltPosition;

@@ -1,6 +1,7 @@
 //! The record of a parcel that leaves: its cuboid, and what makes it doubtful.
 
 use super::{Pipeline, Reference};
+use crate::config::Site;
 use crate::event::{Flags, NotMeasured, ParcelRecord, Shape};
 use crate::image::FrameTime;
 use crate::stage::measure::{self, Measured};
@@ -75,25 +76,33 @@ impl Pipeline {
             belt_travel_mm: reference.at.travel_mm,
             by_encoder: self.by_encoder(),
         };
-        let sigma_max_mm = self.site.config.measure.sigma_max_mm;
+        record.flags.set(doubts(&self.site, measured, travel_sigma), true);
         record.flags.set(Flags::MERGED, track.was_merged());
-        record.flags.set(Flags::CLIPPED, self.reaches_out(p));
-        record.flags.set(Flags::HEIGHT_UNCERTAIN, record.sigma_height_mm > sigma_max_mm);
-        let footprint_sigma_mm = record.sigma_length_mm.max(record.sigma_width_mm);
-        record.flags.set(Flags::FOOTPRINT_UNCERTAIN, footprint_sigma_mm > sigma_max_mm);
-        record.flags.set(Flags::SPEED_ASSUMED, travel_sigma > SPEED_SIGMA_MAX);
-        record.flags.set(Flags::TOO_TALL, record.height_mm > self.site.height_max_mm);
-        record.flags.set(Flags::SILHOUETTE_ONLY, !measured.has_edges);
-        record.flags.set(Flags::HEIGHT_DISPUTED, measured.disputed);
         // A standard deviation above the limit is a flag too.
         record.may_be_used = record.flags.is_empty();
         record
     }
+}
 
-    /// Whether a cuboid reaches over the side of the zone, where nothing of it is used.
-    fn reaches_out(&self, params: &measure::Params) -> bool {
-        let outline = measure::Outline::new(&self.site.view, params, 0.0);
-        let zone = &self.zone;
-        outline.base.iter().any(|v| !(zone.y_min_mm..=zone.y_max_mm).contains(&v.over_belt.y))
-    }
+/// What casts doubt on a cuboid. `travel_sigma`: relative, of the belt's travel over its pass.
+pub fn doubts(site: &Site, measured: &Measured, travel_sigma: f64) -> Flags {
+    let (p, s) = (&measured.estimate.params, &measured.estimate.sigma);
+    let sigma_max_mm = site.config.measure.sigma_max_mm;
+    let footprint_sigma_mm = s[measure::LENGTH].max(s[measure::WIDTH]);
+    let mut flags = Flags::default();
+    flags.set(Flags::CLIPPED, reaches_out(site, p));
+    flags.set(Flags::HEIGHT_UNCERTAIN, s[measure::HEIGHT] > sigma_max_mm);
+    flags.set(Flags::FOOTPRINT_UNCERTAIN, footprint_sigma_mm > sigma_max_mm);
+    flags.set(Flags::SPEED_ASSUMED, travel_sigma > SPEED_SIGMA_MAX);
+    flags.set(Flags::TOO_TALL, p[measure::HEIGHT] > site.height_max_mm);
+    flags.set(Flags::SILHOUETTE_ONLY, !measured.has_edges);
+    flags.set(Flags::HEIGHT_DISPUTED, measured.disputed);
+    flags
+}
+
+/// Whether a cuboid reaches over the side of the zone, where nothing of it is used.
+fn reaches_out(site: &Site, params: &measure::Params) -> bool {
+    let outline = measure::Outline::new(&site.view, params, 0.0);
+    let zone = &site.config.zone;
+    outline.base.iter().any(|v| !(zone.y_min_mm..=zone.y_max_mm).contains(&v.over_belt.y))
 }

@@ -4,15 +4,16 @@
 //! it. Written are its records, one JSON line a parcel, and a picture of the evidence: the belt from above, each
 //! cell with its height, blue low to red high.
 
+use crate::config::Site;
 use crate::error::{Error, Result};
 use crate::event::{Flags, ParcelRecord, Shape};
 use crate::image::FrameTime;
-use crate::pipeline::Pipeline;
+use crate::pipeline::{Pipeline, doubts};
 use crate::plan::Plan;
 use crate::stage::evidence::Evidence;
 use crate::stage::measure::{self, Measured, Rounding, WholePass, canonical_estimate};
 use crate::stage::parcels::{Face, Parcels};
-use crate::stage::views::Views;
+use crate::stage::views::{Kept, Views};
 use image::{Rgb, RgbImage};
 use std::io::Write;
 use std::path::{Path, PathBuf};
@@ -99,15 +100,19 @@ impl Explainer {
         let pass = whole_pass(pipeline);
         let is_raised = |face: &Face| pass.fit(&self.views, face).is_some();
         for face in self.parcels.passed(&self.evidence, &self.views, end_mm, is_raised) {
-            self.record(&pass, &face);
+            self.record(pipeline.site(), &pass, &face);
         }
     }
 
-    fn record(&mut self, pass: &WholePass<'_>, face: &Face) {
-        let Some(measured) = pass.fit(&self.views, face) else { return };
+    fn record(&mut self, site: &Site, pass: &WholePass<'_>, face: &Face) {
+        let Some((measured, travel_sigma)) = pass.fit(&self.views, face) else { return };
         let Some(place) = self.views.newest() else { return };
-        let record = record_of(&measured, &self.views, place, self.records.len() as u32 + 1);
-        let Ok(serde_json::Value::Object(mut told)) = serde_json::to_value(record) else { return };
+        let mut record =
+            record_of(&measured, self.views.kept(place), self.records.len() as u32 + 1);
+        record.flags.set(doubts(site, &measured, travel_sigma), true);
+        let Ok(serde_json::Value::Object(mut told)) = serde_json::to_value(record.rounded()) else {
+            return;
+        };
         let share = (1e3 * measured.estimate.edge_share).round() / 1e3;
         told.insert("edge_share".into(), share.into());
         told.insert("edges".into(), measured.estimate.edge_count.into());
@@ -174,12 +179,11 @@ fn told_of(face: &Face) -> serde_json::Value {
     })
 }
 
-fn record_of(measured: &Measured, views: &Views, place: usize, seq: u32) -> ParcelRecord {
+fn record_of(measured: &Measured, kept: Kept, seq: u32) -> ParcelRecord {
     let estimate = canonical_estimate(measured.estimate);
     let (p, s) = (&estimate.params, &estimate.sigma);
-    let kept = views.kept(place);
     let shape = if measured.is_box { Shape::Box } else { Shape::Irregular };
-    let mut record = ParcelRecord {
+    ParcelRecord {
         seq,
         frame: kept.time.index,
         t_s: kept.time.t_s,
@@ -200,10 +204,7 @@ fn record_of(measured: &Measured, views: &Views, place: usize, seq: u32) -> Parc
         may_be_used: false,
         belt_travel_mm: kept.at.travel_mm,
         by_encoder: false,
-    };
-    record.flags.set(Flags::SILHOUETTE_ONLY, !measured.has_edges);
-    record.flags.set(Flags::HEIGHT_DISPUTED, measured.disputed);
-    record.rounded()
+    }
 }
 
 fn paint(columns: &[Vec<Option<f32>>], height_max_mm: f32) -> RgbImage {

@@ -5,6 +5,7 @@ use super::fit::{DISPUTED_SIGMA, Estimate, GATES_PX, Problem, Silhouette};
 use super::model::{HEIGHT, LENGTH, Outline, Params, Rounding, SCALE, WIDTH, X, Y, YAW};
 use super::observe::{Frame, PassView};
 use super::{BOX_EDGE_SHARE_MIN, EDGE_COUNT_MIN, Measured};
+use crate::belt::BeltPosition;
 use crate::camera::BeltView;
 use crate::stage::parcels::{Face, Rectangle};
 use crate::stage::views::Views;
@@ -37,18 +38,25 @@ pub struct WholePass<'a> {
 
 impl WholePass<'_> {
     /// Fit a cuboid to the views of a face's pass; X holds at the newest view's belt position. Of the
-    /// borders that may be the face's, that one which most edges confirm.
-    pub fn fit(&self, views: &Views, face: &Face) -> Option<Measured> {
+    /// borders that may be the face's, that one which most edges confirm. With it the relative standard
+    /// uncertainty of the belt's travel over the pass.
+    pub fn fit(&self, views: &Views, face: &Face) -> Option<(Measured, f64)> {
         let narrower = face.narrower.iter().flatten();
         let borders = std::iter::once(&face.rectangle).chain(narrower);
         let fits = borders.filter_map(|border| self.fit_border(views, border, face.height_mm));
         fits.reduce(|outer, inner| {
-            let better = inner.estimate.edge_share > outer.estimate.edge_share + CLEARLY_BETTER;
+            let share = |(measured, _): &(Measured, f64)| measured.estimate.edge_share;
+            let better = share(&inner) > share(&outer) + CLEARLY_BETTER;
             if better { inner } else { outer }
         })
     }
 
-    fn fit_border(&self, views: &Views, border: &Rectangle, height_mm: f64) -> Option<Measured> {
+    fn fit_border(
+        &self,
+        views: &Views,
+        border: &Rectangle,
+        height_mm: f64,
+    ) -> Option<(Measured, f64)> {
         let newest = views.kept(views.newest()?).at;
         let mut params = Params::zeros();
         params[X] = border.x_mm + newest.travel_mm;
@@ -60,13 +68,13 @@ impl WholePass<'_> {
         params[SCALE] = 1.0;
         let m = self.geometry.magnification(height_mm);
         let sigma = m * m / self.geometry.camera_height_mm * FACE_HEIGHT_SIGMA_MM;
-        let problem = Problem {
+        let mut problem = Problem {
             geometry: self.geometry,
             zone: self.zone,
             height_max_mm: self.height_max_mm,
             rounding: self.rounding,
             reference_travel_mm: newest.travel_mm,
-            travel_sigma: 3e-4,
+            travel_sigma: 1.0,
             silhouette: Silhouette::Whole,
             enclosing: false,
             top_motion: Some(TopMotion { ratio: m, sigma, highest: m }),
@@ -74,7 +82,8 @@ impl WholePass<'_> {
         };
         let mut best: Option<Estimate> = None;
         for round in 0..ROUNDS {
-            let pass = self.look(views, &params, newest.travel_mm);
+            let (pass, first) = self.look(views, &params, newest.travel_mm);
+            problem.travel_sigma = newest.sigma_since(&first?);
             let fitted = if round == 0 {
                 problem.refine_edges(&pass, params, &GATES_PX)
             } else {
@@ -97,12 +106,19 @@ impl WholePass<'_> {
         let is_box = estimate.edge_share >= BOX_EDGE_SHARE_MIN;
         let off_mm = (estimate.params[HEIGHT] - height_mm).abs();
         let disputed = off_mm > DISPUTED_SIGMA * FACE_HEIGHT_SIGMA_MM.hypot(estimate.sigma[HEIGHT]);
-        Some(Measured { estimate, is_box, has_edges, disputed })
+        Some((Measured { estimate, is_box, has_edges, disputed }, problem.travel_sigma))
     }
 
-    /// Profiles across a cuboid's edges in every view that has any of it in the zone.
-    fn look(&self, views: &Views, params: &Params, reference_travel_mm: f64) -> Vec<PassView> {
+    /// Profiles across a cuboid's edges in every view that has any of it in the zone, and where the belt was in
+    /// the first of them.
+    fn look(
+        &self,
+        views: &Views,
+        params: &Params,
+        reference_travel_mm: f64,
+    ) -> (Vec<PassView>, Option<BeltPosition>) {
         let mut pass: Vec<PassView> = Vec::new();
+        let mut first = None;
         for place in views.places() {
             let travel_mm = views.kept(place).at.travel_mm;
             let outline = Outline::new(self.geometry, params, travel_mm - reference_travel_mm);
@@ -118,8 +134,9 @@ impl WholePass<'_> {
             frame.sample_edges(&outline, &mut view);
             if !view.samples().is_empty() {
                 pass.push(view);
+                first = Some(views.kept(place).at);
             }
         }
-        pass
+        (pass, first)
     }
 }
