@@ -139,7 +139,8 @@ fn none_has_two_numbers(plc: &Plc) {
 
 fn none_lost_or_twice(plc: &Plc) {
     let parcels = plc.taken.len() as u32;
-    assert!(plc.taken.iter().copied().eq(1..=parcels), "a gap or a repetition");
+    let wrong = plc.taken.iter().copied().zip(1..=parcels).find(|(taken, due)| taken != due);
+    assert!(wrong.is_none(), "a gap or a repetition: {wrong:?}, taken and due, of {parcels}");
     none_has_two_numbers(plc);
 }
 
