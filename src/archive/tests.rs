@@ -178,10 +178,11 @@ fn more_entries_than_the_ring_holds_are_counted_and_nobody_waits() {
     archive.finish(Duration::from_millis(1));
 }
 
-static DISK_ANSWERS: AtomicBool = AtomicBool::new(false);
+static DISK_ANSWERS: [AtomicBool; 2] = [const { AtomicBool::new(false) }; 2];
 
-fn disk_that_hangs(folder: &Path) -> std::io::Result<Space> {
-    while !DISK_ANSWERS.load(Ordering::Relaxed) {
+/// A disk for each test that has one.
+fn disk_that_hangs<const DISK: usize>(folder: &Path) -> std::io::Result<Space> {
+    while !DISK_ANSWERS[DISK].load(Ordering::Relaxed) {
         std::thread::sleep(Duration::from_millis(1));
     }
     small_disk(folder)
@@ -190,11 +191,11 @@ fn disk_that_hangs(folder: &Path) -> std::io::Result<Space> {
 #[test]
 fn what_a_hanging_disk_cost_is_told_in_the_chain_too() {
     let folder = folder("hangs");
-    let archive = Archive::start_on(&folder, 64 * MIB, disk_that_hangs).expect("starts");
+    let archive = Archive::start_on(&folder, 64 * MIB, disk_that_hangs::<0>).expect("starts");
     (1..=1000).for_each(|i| archive.put(entry(i, 10)));
     let lost = archive.condition().lost;
     assert!(lost > 900, "{lost}");
-    DISK_ANSWERS.store(true, Ordering::Relaxed);
+    DISK_ANSWERS[0].store(true, Ordering::Relaxed);
     archive.finish(PATIENCE);
     let verdict = Reader::open(&folder).expect("there").verify().expect("readable");
     assert_eq!(verdict.told_lost, lost, "{verdict:?}");
@@ -202,19 +203,10 @@ fn what_a_hanging_disk_cost_is_told_in_the_chain_too() {
     assert!((1..=2).contains(&(verdict.entries + lost - 1000)), "{verdict:?}");
 }
 
-static OTHER_DISK_ANSWERS: AtomicBool = AtomicBool::new(false);
-
-fn other_disk_that_hangs(folder: &Path) -> std::io::Result<Space> {
-    while !OTHER_DISK_ANSWERS.load(Ordering::Relaxed) {
-        std::thread::sleep(Duration::from_millis(1));
-    }
-    small_disk(folder)
-}
-
 #[test]
 fn a_disk_that_does_not_answer_is_told_while_it_is_so_before_anything_is_lost() {
     let folder = folder("silent");
-    let archive = Archive::start_on(&folder, 64 * MIB, other_disk_that_hangs).expect("starts");
+    let archive = Archive::start_on(&folder, 64 * MIB, disk_that_hangs::<1>).expect("starts");
     assert!(!archive.condition().is_bad());
     archive.put(entry(1, 10));
     let start = Instant::now();
@@ -224,7 +216,7 @@ fn a_disk_that_does_not_answer_is_told_while_it_is_so_before_anything_is_lost() 
     }
     let condition = archive.condition();
     assert!(condition.lost == 0 && condition.fault.is_some(), "{condition:?}");
-    OTHER_DISK_ANSWERS.store(true, Ordering::Relaxed);
+    DISK_ANSWERS[1].store(true, Ordering::Relaxed);
     while archive.condition().is_bad() {
         assert!(start.elapsed() < 2 * PATIENCE, "{:?}", archive.condition());
         std::thread::sleep(Duration::from_millis(10));
