@@ -4,12 +4,14 @@ mod common;
 
 use beltgauge::config::{Config, Site};
 use beltgauge::image::Plane;
+use beltgauge::kernel::Level;
 use beltgauge::plan::Plan;
 use beltgauge::run;
 use beltgauge::source::FrameSource;
 use beltgauge::source::synthetic::{Scenario, Synthetic};
 use beltgauge::stage::evidence::Evidence;
-use beltgauge::stage::parcels::Parcels;
+use beltgauge::stage::measure::{Rounding, WholePass};
+use beltgauge::stage::parcels::{Face, Parcels};
 use beltgauge::stage::views::Views;
 
 /// Neighbours 12 mm apart, of other heights, and a flat envelope.
@@ -53,35 +55,49 @@ const SHARE_MIN: f64 = 0.5;
 /// 1.5 m above, by 28 mm. A border behind it is known to that.
 const BORDER_MM: f64 = 28.0;
 
-#[test]
-fn cells_of_a_top_face_agree_on_its_height_and_its_border_is_found() {
+/// What the second opinion saw of a belt.
+struct Seen {
+    scenario: Scenario,
+    evidence: Evidence,
+    faces: Vec<Face>,
+    /// From belt-fixed X to the scenario's.
+    offset_mm: f64,
+}
+
+fn look_at(parcels: &str, frames: u32) -> Seen {
     let camera = common::camera_above([1280, 800], 680.0, 1500.0, [-0.18, 0.08, 0.0, 0.0, -0.008]);
     let text = format!(
-        "seed = 5\nfps = 30\nframes = 170\nexposure_ms = 1.5\n{camera}\
-         [belt]\nspeed_mm_per_s = 500\nwidth_mm = 800\ngrey = 45\ntexture_grey = 1.3\n{PARCELS}"
+        "seed = 5\nfps = 30\nframes = {frames}\nexposure_ms = 1.5\n{camera}\
+         [belt]\nspeed_mm_per_s = 500\nwidth_mm = 800\ngrey = 45\ntexture_grey = 1.3\n{parcels}"
     );
     let scenario = Scenario::parse(&text).expect("valid");
     let config = Config::parse(CONFIG).expect("valid");
     let site = Site::new(config, scenario.camera().expect("valid")).expect("a zone in view");
     let (view, zone, height_max_mm) = (site.view.clone(), site.config.zone, site.height_max_mm);
     let (mut frames, mut pipeline) = run::build(site).expect("fits");
+    let seen = pipeline.seen().to_vec();
     let mut plan = Plan::default();
     Views::plan(&view, &mut plan);
     Evidence::plan(&view, &zone, height_max_mm, &mut plan);
     Parcels::plan(&view, &zone, height_max_mm, &mut plan);
-    let mut memory = plan.reserve(512).expect("fits");
+    let (mut memory, level) = (plan.reserve(512).expect("fits"), Level::new());
     let mut views = Views::new(&view, &zone, &mut memory).expect("planned");
     let mut evidence =
-        Evidence::new(&view, &zone, height_max_mm, pipeline.seen(), &mut memory).expect("planned");
+        Evidence::new(&view, &zone, height_max_mm, level, &seen, &mut memory).expect("planned");
     let mut parcels =
-        Parcels::new(&view, &zone, &evidence, height_max_mm, &mut memory).expect("planned");
+        Parcels::new(&view, &zone, &evidence, height_max_mm, level, &seen, &mut memory)
+            .expect("planned");
     memory.seal().expect("all taken");
-    let mut faces = Vec::new();
-    let mut looked = 0;
-
+    let pass = WholePass {
+        geometry: &view,
+        zone: &zone,
+        height_max_mm,
+        rounding: Rounding::of_radius(0.0),
+        seen: &seen,
+    };
+    let (mut faces, mut looked, mut offset_mm) = (Vec::new(), 0, 0.0);
     let mut source = Synthetic::new(scenario.clone()).expect("a belt");
     let frame = &mut frames[0];
-    let mut offset_mm = 0.0;
     while let Some(time) = source.next_into(frame).expect("frames") {
         let raw = Plane::packed(frame, 1280, 800).expect("its size");
         pipeline.step(raw, time, &mut |_| ()).expect("measures");
@@ -89,19 +105,27 @@ fn cells_of_a_top_face_agree_on_its_height_and_its_border_is_found() {
         if views.offer(pipeline.pixels(), at, time) {
             let place = views.newest().expect("just kept");
             evidence.add(&views, place);
-            parcels.add(&views, place, pipeline.seen());
+            parcels.add(&views, place);
         }
         evidence.advance(&views, at.travel_mm, at.breaks);
         if evidence.decided().end - looked >= 8 {
             looked = evidence.decided().end;
             let end_mm = zone.x_max_mm - at.travel_mm;
-            faces.extend(parcels.passed(&evidence, &views, end_mm, |_| true));
+            let fit = |face: &Face| pass.cuboid(&views, face);
+            faces.extend(parcels.passed(&evidence, &views, end_mm, fit));
         }
         offset_mm = scenario.travel_at_frame_mm(time.index) - at.travel_mm;
     }
+    let fit = |face: &Face| pass.cuboid(&views, face);
+    faces.extend(parcels.passed(&evidence, &views, f64::NEG_INFINITY, fit));
+    Seen { scenario, evidence, faces, offset_mm }
+}
 
-    faces.extend(parcels.passed(&evidence, &views, f64::NEG_INFINITY, |_| true));
+#[test]
+fn cells_of_a_top_face_agree_on_its_height_and_its_border_is_found() {
+    let Seen { scenario, evidence, faces, offset_mm } = look_at(PARCELS, 170);
     assert_eq!(faces.len(), scenario.parcels().len(), "{faces:?}");
+    assert!(faces.iter().all(|face| face.is_cuboid), "{faces:?}");
     let decided = evidence.decided();
     for parcel in scenario.parcels() {
         let mut heights = Vec::new();
@@ -137,5 +161,50 @@ fn cells_of_a_top_face_agree_on_its_height_and_its_border_is_found() {
         for (side_mm, true_mm) in sides.into_iter().zip([parcel.length_mm, parcel.width_mm]) {
             assert!((side_mm - true_mm).abs() < BORDER_MM, "{parcel:?}: {face:?}");
         }
+    }
+}
+
+/// What has no flat top with straight edges.
+const OTHERS: &str = r#"
+[[parcel]]
+shape = "tube"
+length_mm = 300.0
+width_mm = 90.0
+height_mm = 90.0
+yaw_deg = 25.0
+x_mm = -1200.0
+y_mm = 150.0
+material = "kraft"
+[[parcel]]
+shape = "bag"
+length_mm = 270.0
+width_mm = 180.0
+height_mm = 45.0
+yaw_deg = 35.0
+x_mm = -1250.0
+y_mm = -180.0
+material = "white"
+"#;
+
+/// What encloses a thing is known to a cell of 3.5 mm and to the dark line of its own shadow at each side.
+const ENCLOSED_MM: f64 = 14.0;
+
+#[test]
+fn a_tube_and_a_bag_are_enclosed() {
+    let Seen { scenario, faces, offset_mm, .. } = look_at(OTHERS, 180);
+    assert_eq!(faces.len(), scenario.parcels().len(), "{faces:?}");
+    for parcel in scenario.parcels() {
+        let near = |face: &&Face| {
+            let r = &face.rectangle;
+            (r.x_mm + offset_mm - parcel.x_mm).hypot(r.y_mm - parcel.y_mm) < 2.0 * BORDER_MM
+        };
+        let face = faces.iter().find(near).unwrap_or_else(|| panic!("{parcel:?}: {faces:?}"));
+        let r = &face.rectangle;
+        let found = [r.length_mm.max(r.width_mm), r.length_mm.min(r.width_mm), face.height_mm];
+        let truth = [parcel.length_mm, parcel.width_mm, parcel.height_mm];
+        for (found_mm, true_mm) in found.into_iter().zip(truth) {
+            assert!((found_mm - true_mm).abs() < ENCLOSED_MM, "{parcel:?}: {face:?}");
+        }
+        assert!(!face.is_cuboid, "{parcel:?}");
     }
 }

@@ -8,6 +8,7 @@ use crate::config::Site;
 use crate::error::{Error, Result};
 use crate::event::{Flags, ParcelRecord, Shape};
 use crate::image::FrameTime;
+use crate::kernel::Level;
 use crate::pipeline::{Pipeline, doubts};
 use crate::plan::Plan;
 use crate::stage::evidence::Evidence;
@@ -55,8 +56,9 @@ impl Explainer {
         let mib = plan.bytes().div_ceil(1 << 20);
         let mut memory = plan.reserve(mib)?;
         let views = Views::new(view, zone, &mut memory)?;
-        let evidence = Evidence::new(view, zone, site.height_max_mm, pipeline.seen(), &mut memory)?;
-        let parcels = Parcels::new(view, zone, &evidence, site.height_max_mm, &mut memory)?;
+        let (height_max_mm, level, seen) = (site.height_max_mm, Level::new(), pipeline.seen());
+        let evidence = Evidence::new(view, zone, height_max_mm, level, seen, &mut memory)?;
+        let parcels = Parcels::new(view, zone, &evidence, height_max_mm, level, seen, &mut memory)?;
         memory.seal()?;
         let (folder, records, picture) = (folder.to_owned(), Vec::new(), Vec::new());
         Ok(Self {
@@ -85,7 +87,7 @@ impl Explainer {
             && let Some(place) = self.views.newest()
         {
             self.evidence.add(&self.views, place);
-            self.parcels.add(&self.views, place, pipeline.seen());
+            self.parcels.add(&self.views, place);
         }
         self.evidence.advance(&self.views, at.travel_mm, at.breaks);
         let decided = self.evidence.decided();
@@ -98,14 +100,14 @@ impl Explainer {
         self.looked = self.evidence.decided().end;
         self.draw();
         let pass = whole_pass(pipeline);
-        let is_raised = |face: &Face| pass.fit(&self.views, face).is_some();
-        for face in self.parcels.passed(&self.evidence, &self.views, end_mm, is_raised) {
+        let fit = |face: &Face| pass.cuboid(&self.views, face);
+        for face in self.parcels.passed(&self.evidence, &self.views, end_mm, fit) {
             self.record(pipeline.site(), &pass, &face);
         }
     }
 
     fn record(&mut self, site: &Site, pass: &WholePass<'_>, face: &Face) {
-        let Some((measured, travel_sigma)) = pass.fit(&self.views, face) else { return };
+        let Some((measured, travel_sigma)) = pass.measure(&self.views, face) else { return };
         let Some(place) = self.views.newest() else { return };
         let mut record =
             record_of(&measured, self.views.kept(place), self.records.len() as u32 + 1);
@@ -175,7 +177,7 @@ fn told_of(face: &Face) -> serde_json::Value {
         "border_share": (1e2 * face.rectangle.support()).round() / 1e2,
         "sides": face.rectangle.sides.map(|share| (1e2 * share).round() / 1e2),
         "cells": face.cells,
-        "stacked": face.stacked,
+        "is_cuboid": face.is_cuboid,
     })
 }
 

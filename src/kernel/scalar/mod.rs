@@ -7,4 +7,5 @@ pub mod mixture;
 pub mod profile;
 pub mod remap;
 pub mod runs;
+pub mod semblance;
 pub mod texture;

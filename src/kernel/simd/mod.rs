@@ -8,6 +8,7 @@
 pub mod corners;
 pub mod mixture;
 pub mod remap;
+pub mod semblance;
 pub mod texture;
 
 /// Run a test at every level that this processor has.

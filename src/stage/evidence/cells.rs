@@ -18,8 +18,6 @@ const CELL_MM: f64 = 3.5;
 pub(in crate::stage) const DARK_GREY: f32 = 6.0;
 /// Units of a cell's value for a factor of e.
 const UNITS: f32 = 160.0;
-/// A cell that the camera does not see.
-pub const UNSEEN: i8 = i8::MIN;
 /// How fast what stands still is learned, a view: its median.
 const STILL_STEP: f32 = 0.012;
 
@@ -29,9 +27,13 @@ pub struct Cells {
     pub cell_px: usize,
     /// Cells along and across the view.
     pub size: [usize; 2],
-    usable: Block<bool>,
+    /// Whether the camera sees a cell with its surroundings: 0 or 1.
+    seen: Block<u8>,
+    /// Logarithms of the mean, by the sum of a cell's grey values.
+    log_of_sum: Block<f32>,
     log: Block<f32>,
     slow: Block<f32>,
+    scratch: Block<f32>,
     still: Block<f32>,
     values: Block<i8>,
 }
@@ -39,6 +41,11 @@ pub struct Cells {
 /// Pixels of a cell's side.
 pub fn cell_px(view: &BeltView) -> usize {
     (CELL_MM / view.mm_per_px).round().max(1.0) as usize
+}
+
+/// Cells across a view.
+pub fn rows(view: &BeltView) -> usize {
+    size_of(view).1[1]
 }
 
 fn size_of(view: &BeltView) -> (usize, [usize; 2]) {
@@ -49,15 +56,13 @@ fn size_of(view: &BeltView) -> (usize, [usize; 2]) {
 impl Cells {
     /// Memory for a view.
     pub fn plan(view: &BeltView, plan: &mut Plan) {
-        let (_, [columns, rows]) = size_of(view);
+        let (cell_px, [columns, rows]) = size_of(view);
         let n = columns * rows;
-        plan.add::<bool>(
-            "evidence.usable",
-            n,
-            "cells that the camera sees with their surroundings",
-        );
+        plan.add::<u8>("evidence.seen_cells", n, "cells that the camera sees with all around");
+        plan.add::<f32>("evidence.log_of_sum", 255 * cell_px * cell_px + 1, "logarithms");
         plan.add::<f32>("evidence.log", n, "logarithm of a view's cells");
         plan.add::<f32>("evidence.slow", n, "its slow part");
+        plan.add::<f32>("evidence.scratch", n, "the other half of each smoothing");
         plan.add::<f32>("evidence.still", n, "what does not move with the belt");
         plan.add::<i8>("evidence.cells", n * VIEWS_MAX, "fine structure of each view kept");
     }
@@ -66,7 +71,6 @@ impl Cells {
     pub fn new(view: &BeltView, seen: &[u64], memory: &mut Memory) -> Result<Self> {
         let (cell_px, size) = size_of(view);
         let [columns, rows] = size;
-        let mut usable = memory.take("evidence.usable", false)?;
         let n = words(view.size_px[0]);
         let is_seen = |u: usize, v: usize| bits::get(&seen[v * n..][..n], u);
         let whole = |column: usize, row: usize| {
@@ -77,60 +81,68 @@ impl Cells {
                 && is_seen(u, v + last)
                 && is_seen(u + last, v + last)
         };
+        let mut seen_cells = memory.take("evidence.seen_cells", 0)?;
         let reach = 2 * REACH;
         for column in reach..columns.saturating_sub(reach) {
             for row in reach..rows.saturating_sub(reach) {
-                usable[column * rows + row] = [column - reach, column + reach]
+                let all = [column - reach, column + reach]
                     .into_iter()
                     .all(|c| [row - reach, row + reach].into_iter().all(|r| whole(c, r)));
+                seen_cells[column * rows + row] = u8::from(all);
             }
+        }
+        let mut log_of_sum = memory.take("evidence.log_of_sum", 0.0)?;
+        let share = 1.0 / (cell_px * cell_px) as f32;
+        for (sum, log) in log_of_sum.iter_mut().enumerate() {
+            *log = (sum as f32 * share + DARK_GREY).ln();
         }
         Ok(Self {
             cell_px,
             size,
-            usable,
+            seen: seen_cells,
+            log_of_sum,
             log: memory.take("evidence.log", 0.0)?,
             slow: memory.take("evidence.slow", 0.0)?,
+            scratch: memory.take("evidence.scratch", 0.0)?,
             still: memory.take("evidence.still", 0.0)?,
-            values: memory.take("evidence.cells", UNSEEN)?,
+            values: memory.take("evidence.cells", 0)?,
         })
     }
 
     /// Take the fine structure of the view at `place`.
     pub fn add(&mut self, grey: Plane<'_>, place: usize) {
         let [columns, rows] = self.size;
-        let scale = 1.0 / (self.cell_px * self.cell_px) as f32;
         for row in 0..rows {
             for column in 0..columns {
-                let mut sum = 0u32;
+                let mut sum = 0;
                 for v in row * self.cell_px..(row + 1) * self.cell_px {
                     let pixels = &grey.row(v)[column * self.cell_px..][..self.cell_px];
-                    sum += pixels.iter().map(|&p| u32::from(p)).sum::<u32>();
+                    sum += pixels.iter().map(|&p| usize::from(p)).sum::<usize>();
                 }
-                self.log[column * rows + row] = (sum as f32 * scale + DARK_GREY).ln();
+                self.log[column * rows + row] = self.log_of_sum[sum];
             }
         }
         self.slow.copy_from_slice(&self.log);
         for _ in 0..2 {
-            for column in self.slow.chunks_exact_mut(rows) {
-                box_filter(column, 1, rows);
-            }
-            for row in 0..rows {
-                box_filter(&mut self.slow[row..], rows, columns);
-            }
+            box_filter(&mut self.slow, &mut self.scratch, rows);
         }
         let values = &mut self.values[place * columns * rows..][..columns * rows];
         let fine = self.log.iter().zip(&*self.slow).map(|(log, slow)| log - slow);
-        let cells = values.iter_mut().zip(&mut *self.still).zip(&*self.usable).zip(fine);
-        for (((value, still), _), fine) in cells.filter(|((_, usable), _)| **usable) {
+        let cells = values.iter_mut().zip(&mut *self.still).zip(&*self.seen).zip(fine);
+        for (((value, still), _), fine) in cells.filter(|((_, seen), _)| **seen > 0) {
             *still += (fine - *still).clamp(-STILL_STEP, STILL_STEP);
             *value = ((fine - *still) * UNITS).round().clamp(-127.0, 127.0) as i8;
         }
     }
 
-    /// The fine structure of the view at `place`: columns one after the other.
+    /// The fine structure of the view at `place`: columns one after the other, 0 where it is not seen.
     pub fn view(&self, place: usize) -> &[i8] {
         let n = self.size[0] * self.size[1];
         &self.values[place * n..][..n]
+    }
+
+    /// Which cells every view sees: 0 or 1.
+    pub fn seen(&self) -> &[u8] {
+        &self.seen
     }
 }

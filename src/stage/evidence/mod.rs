@@ -11,10 +11,13 @@ mod cells;
 
 use crate::camera::BeltView;
 use crate::error::Result;
+use crate::kernel::Level;
+use crate::kernel::scalar::semblance::{self, CELL_ONE, CellSums, Columns, FRACTION_ONE};
+use crate::kernel::simd::semblance::add_cells;
 use crate::plan::{Block, Memory, Plan};
 use crate::stage::views::Views;
 use crate::units::BeltRect;
-use cells::{Cells, UNSEEN};
+use cells::Cells;
 
 pub(super) use cells::DARK_GREY;
 
@@ -23,6 +26,8 @@ pub(super) use cells::DARK_GREY;
 const PLANE_STEP_CELLS: f64 = 1.5;
 /// Trial planes at most.
 const PLANES_MAX: usize = 80;
+/// The belt itself: one plane is below it.
+const BELT_PLANE: usize = 1;
 /// Columns whose sums are kept: the smoothing reaches two to either side.
 const COLUMNS_KEPT: usize = 5;
 /// Smoothing over neighbouring cells.
@@ -34,7 +39,7 @@ const VIEWS_MIN: f32 = 7.0;
 /// Views agree on a height from this semblance on.
 const SEMBLANCE_MIN: f32 = 0.4;
 /// Structure below this, in units of a cell's value, is noise.
-const STRENGTH_MIN: f32 = 2.5;
+const STRENGTH_MIN: f32 = 2.85;
 /// Heights whose semblance is this near to the best are possible too.
 const POSSIBLE_SHARE: f32 = 0.85;
 /// A column is decided when this share of the zone is still before it: what follows a parcel's label must
@@ -59,13 +64,15 @@ pub struct Evidence {
     geometry: BeltView,
     zone: BeltRect,
     cells: Cells,
+    level: Level,
     cell_mm: f64,
     rows: usize,
     /// Heights of the trial planes, mm, rising, and their magnifications.
     planes: Block<[f64; 2]>,
-    sum: Block<f32>,
-    squares: Block<f32>,
-    seen: Block<f32>,
+    /// Sums over the views of one column, by plane and row of the views' cells.
+    sum: Block<i16>,
+    squares: Block<i32>,
+    views: Block<i16>,
     /// Of the last columns: squared sum, and views times squares; by plane and row.
     sums: Block<[f32; 2]>,
     smooth: Block<[f32; 2]>,
@@ -91,6 +98,7 @@ fn planes_of(view: &BeltView, zone: &BeltRect, height_max_mm: f64, cell_mm: f64)
 
 struct Sizes {
     rows: usize,
+    view_rows: usize,
     planes: usize,
     columns: usize,
 }
@@ -105,18 +113,18 @@ impl Evidence {
         let rows = ((zone.y_max_mm - zone.y_min_mm) / cell_mm).ceil() as usize;
         let (planes, _) = planes_of(view, zone, height_max_mm, cell_mm);
         let columns = (2.0 * zone.length_mm() / cell_mm).ceil() as usize;
-        Sizes { rows, planes, columns }
+        Sizes { rows, view_rows: cells::rows(view), planes, columns }
     }
 
     /// Memory for a site.
     pub fn plan(view: &BeltView, zone: &BeltRect, height_max_mm: f64, plan: &mut Plan) {
         Cells::plan(view, plan);
-        let Sizes { rows, planes, columns } = Self::sizes(view, zone, height_max_mm);
+        let Sizes { rows, view_rows, planes, columns } = Self::sizes(view, zone, height_max_mm);
         let n = rows * planes;
         plan.add::<[f64; 2]>("evidence.planes", planes, "height and magnification of each plane");
-        plan.add::<f32>("evidence.sum", n, "a column's sum at each plane");
-        plan.add::<f32>("evidence.squares", n, "its sum of squares");
-        plan.add::<f32>("evidence.seen", n, "its views");
+        plan.add::<i16>("evidence.sum", view_rows * planes, "a column's sum at each plane");
+        plan.add::<i32>("evidence.squares", view_rows * planes, "its sum of squares");
+        plan.add::<i16>("evidence.views", view_rows * planes, "its views");
         plan.add::<[f32; 2]>("evidence.sums", n * COLUMNS_KEPT, "energies of the last columns");
         plan.add::<[f32; 2]>("evidence.smooth", n, "energies, smoothed");
         plan.add::<f32>("evidence.views_seen", rows * COLUMNS_KEPT, "views of each cell");
@@ -128,6 +136,7 @@ impl Evidence {
         view: &BeltView,
         zone: &BeltRect,
         height_max_mm: f64,
+        level: Level,
         seen: &[u64],
         memory: &mut Memory,
     ) -> Result<Self> {
@@ -137,7 +146,7 @@ impl Evidence {
         let mut planes = memory.take("evidence.planes", [0.0; 2])?;
         let (_, step) = planes_of(view, zone, height_max_mm, cell_mm);
         for (k, plane) in planes.iter_mut().enumerate() {
-            let magnification = 1.0 + step * (k as f64 - 1.0);
+            let magnification = 1.0 + step * (k as f64 - BELT_PLANE as f64);
             *plane = [view.camera_height_mm * (1.0 - 1.0 / magnification), magnification];
         }
         Ok(Self {
@@ -147,9 +156,10 @@ impl Evidence {
             cell_mm,
             rows,
             planes,
-            sum: memory.take("evidence.sum", 0.0)?,
-            squares: memory.take("evidence.squares", 0.0)?,
-            seen: memory.take("evidence.seen", 0.0)?,
+            level,
+            sum: memory.take("evidence.sum", 0)?,
+            squares: memory.take("evidence.squares", 0)?,
+            views: memory.take("evidence.views", 0)?,
             sums: memory.take("evidence.sums", [0.0; 2])?,
             smooth: memory.take("evidence.smooth", [0.0; 2])?,
             views_seen: memory.take("evidence.views_seen", 0.0)?,
@@ -219,67 +229,90 @@ impl Evidence {
     }
 
     fn sum_up(&mut self, views: &Views, column: i64) {
-        let (rows, size) = (self.rows, self.cells.size);
-        self.sum.fill(0.0);
-        self.squares.fill(0.0);
-        self.seen.fill(0.0);
-        let cell_px = self.cells.cell_px as f64;
-        // Middle of the view's first cell.
-        let origin_mm = [
-            self.geometry.origin.x + 0.5 * (cell_px - 1.0) * self.geometry.mm_per_px,
-            self.geometry.origin.y - 0.5 * (cell_px - 1.0) * self.geometry.mm_per_px,
-        ];
-        let side_mm = cell_px * self.geometry.mm_per_px;
-        let nadir = self.geometry.nadir;
-        let mut whole = 0.0;
-        for place in views.places() {
+        self.sum.fill(0);
+        self.squares.fill(0);
+        self.views.fill(0);
+        let mut whole = 0;
+        for place in views.places().take(semblance::VIEWS_MAX) {
             let x_mm = self.column_mm(column) + views.kept(place).at.travel_mm;
             if x_mm < self.zone.x_min_mm {
                 break;
             }
-            whole += 1.0;
-            let view = self.cells.view(place);
-            for (k, &[_, m]) in self.planes.iter().enumerate() {
-                let u = (nadir.x + m * (x_mm - nadir.x) - origin_mm[0]) / side_mm;
-                if u < 0.0 || u >= (size[0] - 1) as f64 {
-                    continue;
-                }
-                let (i, fu) = (u as usize, u.fract() as f32);
-                let [left, right] = [i, i + 1].map(|c| &view[c * size[1]..][..size[1]]);
-                let v0 = (origin_mm[1] - (nadir.y + m * (self.row_mm(0) - nadir.y))) / side_mm;
-                let step = m * self.cell_mm / side_mm;
-                let [sum, squares, seen] = [&mut self.sum, &mut self.squares, &mut self.seen]
-                    .map(|b| &mut b[k * rows..][..rows]);
-                for row in 0..rows {
-                    let v = v0 + row as f64 * step;
-                    if v < 0.0 || v >= (size[1] - 1) as f64 {
-                        continue;
-                    }
-                    let (j, fv) = (v as usize, v.fract() as f32);
-                    let [a, b, c, d] = [left[j], left[j + 1], right[j], right[j + 1]];
-                    if a == UNSEEN || b == UNSEEN || c == UNSEEN || d == UNSEEN {
-                        continue;
-                    }
-                    let [a, b, c, d] = [a, b, c, d].map(f32::from);
-                    let (l, r) = (a + fv * (b - a), c + fv * (d - c));
-                    let w = l + fu * (r - l);
-                    sum[row] += w;
-                    squares[row] += w * w;
-                    seen[row] += 1.0;
-                }
-            }
+            whole += 1;
+            self.add_view(place, x_mm);
         }
         let kept = column.rem_euclid(COLUMNS_KEPT as i64) as usize;
-        self.views_whole[kept] = whole;
-        let n = self.planes.len() * rows;
-        let sums = &mut self.sums[kept * n..][..n];
-        for (i, out) in sums.iter_mut().enumerate() {
-            *out = [self.sum[i] * self.sum[i], self.seen[i] * self.squares[i]];
+        self.views_whole[kept] = whole as f32;
+        for plane in 0..self.planes.len() {
+            self.take_energies(plane, kept);
         }
-        // Views of the plane of the belt, for the share.
-        for row in 0..rows {
-            self.views_seen[kept * rows + row] = self.seen[rows + row];
+    }
+
+    /// Add a view's cells at `x_mm`, for every plane.
+    fn add_view(&mut self, place: usize, x_mm: f64) {
+        let [columns, rows] = self.cells.size;
+        let (values, seen) = (self.cells.view(place), self.cells.seen());
+        let [first_mm, side_mm] = [self.first_cell_mm()[0], self.view_cell_mm()];
+        let nadir_mm = self.geometry.nadir.x;
+        for (plane, &[_, m]) in self.planes.iter().enumerate() {
+            let u = (nadir_mm + m * (x_mm - nadir_mm) - first_mm) / side_mm;
+            if u < 0.0 || u >= (columns - 1) as f64 {
+                continue;
+            }
+            let left = u as usize * rows;
+            let columns = Columns {
+                values: [&values[left..][..rows], &values[left + rows..][..rows]],
+                seen: [&seen[left..][..rows], &seen[left + rows..][..rows]],
+                fraction: (u.fract() * f64::from(FRACTION_ONE)).round() as i16,
+            };
+            let here = plane * rows..(plane + 1) * rows;
+            let mut sums = CellSums {
+                sum: &mut self.sum[here.clone()],
+                squares: &mut self.squares[here.clone()],
+                views: &mut self.views[here],
+            };
+            add_cells(self.level, columns, &mut sums);
         }
+    }
+
+    /// Energies of a plane, from the rows of the views' cells to the scroll's.
+    fn take_energies(&mut self, plane: usize, kept: usize) {
+        let (view_rows, m) = (self.cells.size[1], self.planes[plane][1]);
+        let here = plane * view_rows..(plane + 1) * view_rows;
+        let (sum, squares) = (&self.sum[here.clone()], &self.squares[here.clone()]);
+        let views = &self.views[here];
+        let [_, first_mm] = self.first_cell_mm();
+        let side_mm = self.view_cell_mm();
+        let nadir_mm = self.geometry.nadir.y;
+        let n = self.planes.len() * self.rows;
+        for row in 0..self.rows {
+            let v = (first_mm - (nadir_mm + m * (self.row_mm(row) - nadir_mm))) / side_mm;
+            let inside = v >= 0.0 && v < (view_rows - 1) as f64;
+            let (j, share) = if inside { (v as usize, v.fract() as f32) } else { (0, 0.0) };
+            let energies = [j, j + 1].map(|j| {
+                let [sum, squares] = [f32::from(sum[j]), squares[j] as f32];
+                [sum * sum, f32::from(views[j]) * squares]
+            });
+            let between = |k: usize| energies[0][k] + share * (energies[1][k] - energies[0][k]);
+            let energy = if inside { [between(0), between(1)] } else { [0.0; 2] };
+            self.sums[kept * n + plane * self.rows + row] = energy;
+            // Seen at the belt's plane is seen.
+            if plane == BELT_PLANE {
+                let seen = if inside { views[j].min(views[j + 1]) } else { 0 };
+                self.views_seen[kept * self.rows + row] = f32::from(seen);
+            }
+        }
+    }
+
+    /// Middle of the view's first cell, mm.
+    fn first_cell_mm(&self) -> [f64; 2] {
+        let middle_mm = 0.5 * (self.cells.cell_px as f64 - 1.0) * self.geometry.mm_per_px;
+        [self.geometry.origin.x + middle_mm, self.geometry.origin.y - middle_mm]
+    }
+
+    /// Side of the views' cells, mm.
+    fn view_cell_mm(&self) -> f64 {
+        self.cells.cell_px as f64 * self.geometry.mm_per_px
     }
 
     fn decide(&mut self, column: i64) {
@@ -321,7 +354,8 @@ impl Evidence {
                 continue;
             };
             let s = semblance(best);
-            let strength = self.smooth[best * rows + row][0].sqrt() / seen;
+            let sum = self.smooth[best * rows + row][0].sqrt() / f32::from(CELL_ONE);
+            let strength = sum / seen;
             if s < SEMBLANCE_MIN || strength < STRENGTH_MIN || best == 0 || best + 1 == planes {
                 continue;
             }

@@ -7,12 +7,14 @@ use super::observe::{Frame, PassView};
 use super::{BOX_EDGE_SHARE_MIN, EDGE_COUNT_MIN, Measured};
 use crate::belt::BeltPosition;
 use crate::camera::BeltView;
-use crate::stage::parcels::{Face, Rectangle};
+use crate::stage::parcels::{Cuboid, Face, Rectangle};
 use crate::stage::views::Views;
 use crate::units::BeltRect;
 
 /// A face's height from the evidence is good to this, mm.
 const FACE_HEIGHT_SIGMA_MM: f64 = 6.0;
+/// The sides of a face that is no cuboid's are good to this, mm.
+const FACE_SIDE_SIGMA_MM: f64 = 5.0;
 /// A border further inside must explain this share of the edges more.
 const CLEARLY_BETTER: f64 = 0.03;
 /// Lower than this is the belt, mm.
@@ -37,10 +39,31 @@ pub struct WholePass<'a> {
 }
 
 impl WholePass<'_> {
-    /// Fit a cuboid to the views of a face's pass; X holds at the newest view's belt position. Of the
-    /// borders that may be the face's, that one which most edges confirm. With it the relative standard
-    /// uncertainty of the belt's travel over the pass.
-    pub fn fit(&self, views: &Views, face: &Face) -> Option<(Measured, f64)> {
+    /// Measure the parcel of a face from the views of its pass; X holds at the newest view's belt position. With it the
+    /// relative standard uncertainty of the belt's travel over the pass. What has no cuboid's edges is as large as the
+    /// face found of it.
+    pub fn measure(&self, views: &Views, face: &Face) -> Option<(Measured, f64)> {
+        let fitted = if face.is_cuboid { self.fit(views, face) } else { None };
+        fitted.filter(|(measured, _)| measured.is_box).or_else(|| self.enclose(views, face))
+    }
+
+    /// The cuboid that the edges around a face show, if it lies over the belt.
+    pub fn cuboid(&self, views: &Views, face: &Face) -> Option<Cuboid> {
+        let (measured, _) = self.fit_border(views, &face.rectangle, face.height_mm)?;
+        let p = &measured.estimate.params;
+        let rectangle = Rectangle {
+            x_mm: p[X] - views.kept(views.newest()?).at.travel_mm,
+            y_mm: p[Y],
+            yaw: p[YAW],
+            length_mm: p[LENGTH],
+            width_mm: p[WIDTH],
+            ..face.rectangle
+        };
+        Some(Cuboid { rectangle, height_mm: p[HEIGHT], is_box: measured.is_box })
+    }
+
+    /// Fit a cuboid. Of the borders that may be the face's, that one which most edges confirm.
+    fn fit(&self, views: &Views, face: &Face) -> Option<(Measured, f64)> {
         let narrower = face.narrower.iter().flatten();
         let borders = std::iter::once(&face.rectangle).chain(narrower);
         let fits = borders.filter_map(|border| self.fit_border(views, border, face.height_mm));
@@ -51,6 +74,40 @@ impl WholePass<'_> {
         })
     }
 
+    fn enclose(&self, views: &Views, face: &Face) -> Option<(Measured, f64)> {
+        let newest = views.kept(views.newest()?).at;
+        let params = Self::params_of(&face.rectangle, face.height_mm, newest.travel_mm);
+        let (_, first) = self.look(views, &params, newest.travel_mm);
+        let mut sigma = Params::zeros();
+        for k in [X, Y, LENGTH, WIDTH] {
+            sigma[k] = FACE_SIDE_SIGMA_MM;
+        }
+        sigma[HEIGHT] = FACE_HEIGHT_SIGMA_MM;
+        let estimate = Estimate {
+            params,
+            sigma,
+            edge_share: face.rectangle.support(),
+            edge_count: 0,
+            edge_contrast: 0.0,
+            reach_error: 0.0,
+        };
+        let measured = Measured { estimate, is_box: false, has_edges: true, disputed: false };
+        Some((measured, newest.sigma_since(&first?)))
+    }
+
+    /// The cuboid of a face when the belt has travelled so far.
+    fn params_of(border: &Rectangle, height_mm: f64, travel_mm: f64) -> Params {
+        let mut params = Params::zeros();
+        params[X] = border.x_mm + travel_mm;
+        params[Y] = border.y_mm;
+        params[YAW] = border.yaw;
+        params[LENGTH] = border.length_mm;
+        params[WIDTH] = border.width_mm;
+        params[HEIGHT] = height_mm;
+        params[SCALE] = 1.0;
+        params
+    }
+
     fn fit_border(
         &self,
         views: &Views,
@@ -58,14 +115,7 @@ impl WholePass<'_> {
         height_mm: f64,
     ) -> Option<(Measured, f64)> {
         let newest = views.kept(views.newest()?).at;
-        let mut params = Params::zeros();
-        params[X] = border.x_mm + newest.travel_mm;
-        params[Y] = border.y_mm;
-        params[YAW] = border.yaw;
-        params[LENGTH] = border.length_mm;
-        params[WIDTH] = border.width_mm;
-        params[HEIGHT] = height_mm;
-        params[SCALE] = 1.0;
+        let mut params = Self::params_of(border, height_mm, newest.travel_mm);
         let m = self.geometry.magnification(height_mm);
         let sigma = m * m / self.geometry.camera_height_mm * FACE_HEIGHT_SIGMA_MM;
         let mut problem = Problem {

@@ -1,53 +1,40 @@
-//! Which parts of the scroll are a parcel's top face.
+//! Which parts of the scroll are a parcel.
 //!
 //! In: the decided part of the scroll, and the views. Out: upright rectangles at a height. A top face is
 //! flat: neighbouring cells of one height begin it, be they its border or only a label on it. The views
 //! stacked on the plane of that height show its whole border sharp; the rectangle around the beginning
-//! whose four sides are explained best is the face. What is lower beside it is its sides; what is higher
-//! on it stands on it.
+//! whose four sides are explained best is the face. Edges tell the cuboid then, and the cells within tell whether it is
+//! one: where they are higher than its top, it is the outline of a bag or a stack; where they lie on the belt, it
+//! is nothing. What is raised and belongs to no face, as a tube, is enclosed as it is.
 
+mod enclosing;
+mod face;
 mod rectangle;
+mod scroll;
 mod stack;
 mod steps;
 mod still;
 
-use super::evidence::{Cell, Evidence};
+use super::evidence::Evidence;
 use super::views::Views;
 use crate::camera::BeltView;
 use crate::error::Result;
+use crate::kernel::Level;
 use crate::plan::{Memory, Plan};
 use crate::units::BeltRect;
+use enclosing::Side;
+use face::is_border;
 use rectangle::{CROP_MM, GRID_MM, RectangleSearch};
+use scroll::{CELLS_MIN, Content, HEIGHT_MIN_MM, HIGHEST_SHARE, Scroll};
 use stack::{Stack, WINDOW_MAX_MM, Window};
 use steps::{Scale, Steps};
 use still::Still;
 
+pub use face::{Cuboid, Face};
 pub use rectangle::Rectangle;
 
-/// Trial planes are this far apart, mm.
-const PLANE_STEP_MM: f32 = 3.0;
-/// A cell belongs to a plane that is this near, mm.
-const TOLERANCE_MM: f32 = 6.0;
-/// Lower than this is the belt, mm: cells of the belt scatter by 1 mm.
-const HEIGHT_MIN_MM: f32 = 2.4;
-/// A cell whose possible heights span more than this, mm, tells none.
-const NARROW_MM: f32 = 40.0;
-/// Cells of one beginning are at most this far apart, cells.
-const GAP: i32 = 2;
-/// Columns behind a group that must be decided before it is whole.
-const WAIT_COLUMNS: usize = 8;
-/// A smaller group this near to a larger one that is not whole waits for it, cells.
-const BESIDE_CELLS: usize = 6;
-/// A beginning of fewer cells is an accident.
-const CELLS_MIN: usize = 12;
 /// What is looked at around a beginning, mm.
 const REACH_MM: f64 = 420.0;
-/// A border with less than this share of edge is an accident.
-const SUPPORT_MIN: f64 = 0.65;
-/// Each side has at least this share of edge.
-const SIDE_SUPPORT_MIN: f64 = 0.25;
-/// Lines that happen to lie right give this share.
-const ACCIDENT_SUPPORT: f64 = 0.55;
 /// Where the plane of the sharpest border is sought around the cells' height, mm, coarse and fine.
 const HEIGHT_OFFSETS_MM: [&[f64]; 2] = [&[-5.0, 5.0, -10.0, 10.0, -15.0, 15.0], &[-2.5, 2.5]];
 /// Times that the border is sought anew on the plane where it was sharpest.
@@ -56,29 +43,8 @@ const LOOKS: usize = 2;
 const CANDIDATES: usize = 2;
 /// What is looked at around a known border, mm.
 const NEAR_MM: f64 = 40.0;
-/// Cells this far around a face are its own: its sides, mm.
-const SIDE_MM: f64 = 10.0;
-/// Two faces are one parcel's when this share of one lies inside the other.
-const OVERLAP_SHARE: f64 = 0.3;
-/// What lies on another has its border, and so has that one, for this share.
-const STACK_SUPPORT: f64 = 0.75;
-/// Faces whose heights differ by more are on top of each other, mm.
-const STEP_MM: f64 = 12.0;
-
-/// A parcel's top face.
-#[derive(Clone, Copy, Debug, PartialEq)]
-pub struct Face {
-    /// Its border.
-    pub rectangle: Rectangle,
-    /// For each side the border with a line further inside that may be it, too.
-    pub narrower: [Option<Rectangle>; 4],
-    /// Over the belt, mm.
-    pub height_mm: f64,
-    /// Cells that began it.
-    pub cells: usize,
-    /// Something lies on it: the height is that one's.
-    pub stacked: bool,
-}
+/// What no face explains is a thing if it is wider than this, mm: an edge alone spreads cells over 32 mm.
+const SIDE_MIN_MM: f64 = 40.0;
 
 /// The views of a pass at one scale, and what of them is looked at.
 struct Layer {
@@ -94,15 +60,22 @@ impl Layer {
         Stack::plan(view, scale, zone, height_max_mm, plan);
     }
 
-    fn new(view: &BeltView, scale: Scale, zone: &BeltRect, memory: &mut Memory) -> Result<Self> {
-        let steps = Steps::new(view, scale, memory)?;
+    fn new(
+        view: &BeltView,
+        scale: Scale,
+        zone: &BeltRect,
+        level: Level,
+        seen: &[u64],
+        memory: &mut Memory,
+    ) -> Result<Self> {
+        let steps = Steps::new(view, scale, seen, memory)?;
         let still = Still::new(view, scale, memory)?;
-        Ok(Self { steps, still, stack: Stack::new(view, scale, zone, memory)? })
+        Ok(Self { steps, still, stack: Stack::new(view, scale, zone, level, memory)? })
     }
 
-    fn add(&mut self, views: &Views, place: usize, seen: &[u64]) {
-        self.steps.add(views.grey(place), seen, place);
-        self.still.add(self.steps.picture(place).grey);
+    fn add(&mut self, views: &Views, place: usize) {
+        self.steps.add(views.grey(place), place);
+        self.still.add(self.steps.picture(place).grey, self.steps.seen());
     }
 
     /// Stack the views on a window at a height: x and y, lowest and highest, mm.
@@ -112,22 +85,16 @@ impl Layer {
     }
 }
 
-/// The undecided part of the scroll.
+/// The search.
 pub struct Parcels {
-    /// First column that is looked at, and its cells and whether they are free.
-    first: i64,
-    cells: Vec<Cell>,
-    free: Vec<bool>,
-    rows: usize,
-    cell_mm: f64,
-    row_0_mm: f64,
-    height_max_mm: f32,
+    scroll: Scroll,
+    height_max_mm: f64,
     fine: Layer,
     coarse: Layer,
     search: RectangleSearch,
-    /// Faces found, not yet passed on.
+    /// Found, not yet passed on.
     waiting: Vec<Face>,
-    /// Faces passed on whose cells may still come.
+    /// Passed on; their cells may still come.
     gone: Vec<Face>,
 }
 
@@ -139,195 +106,75 @@ impl Parcels {
         RectangleSearch::plan(zone, plan);
     }
 
-    /// Nothing seen.
+    /// Nothing seen. `seen`: bit mask of the view's pixels that the camera sees.
     pub fn new(
         view: &BeltView,
         zone: &BeltRect,
         evidence: &Evidence,
         height_max_mm: f64,
+        level: Level,
+        seen: &[u64],
         memory: &mut Memory,
     ) -> Result<Self> {
         Ok(Self {
-            first: 0,
-            cells: Vec::new(),
-            free: Vec::new(),
-            rows: evidence.rows(),
-            cell_mm: evidence.side_mm(),
-            row_0_mm: evidence.row_mm(0),
-            height_max_mm: height_max_mm as f32,
-            fine: Layer::new(view, Scale::Fine, zone, memory)?,
-            coarse: Layer::new(view, Scale::Coarse, zone, memory)?,
+            scroll: Scroll::new(evidence, height_max_mm),
+            height_max_mm,
+            fine: Layer::new(view, Scale::Fine, zone, level, seen, memory)?,
+            coarse: Layer::new(view, Scale::Coarse, zone, level, seen, memory)?,
             search: RectangleSearch::new(memory)?,
             waiting: Vec::new(),
             gone: Vec::new(),
         })
     }
 
-    /// A view more. `seen`: bit mask of the view's pixels that the camera sees.
-    pub fn add(&mut self, views: &Views, place: usize, seen: &[u64]) {
-        self.fine.add(views, place, seen);
-        self.coarse.add(views, place, seen);
+    /// A view more.
+    pub fn add(&mut self, views: &Views, place: usize) {
+        self.fine.add(views, place);
+        self.coarse.add(views, place);
     }
 
-    /// The faces whose trailing end has passed `end_mm`, X less the belt's travel. `is_raised`: whether a face
-    /// lies over the belt, by its edges; what lies on the belt itself carries no parcel as a stack does.
+    /// The parcels whose trailing end has passed `end_mm`, X less the belt's travel. `fit`: the cuboid
+    /// that the edges around a face show, if it lies over the belt.
     pub fn passed(
         &mut self,
         evidence: &Evidence,
         views: &Views,
         end_mm: f64,
-        is_raised: impl Fn(&Face) -> bool,
+        fit: impl Fn(&Face) -> Option<Cuboid>,
     ) -> Vec<Face> {
-        self.take_columns(evidence);
-        let ended = end_mm == f64::NEG_INFINITY;
-        for (members, height_mm) in self.beginnings(ended) {
-            let members: Vec<usize> = members.into_iter().filter(|&i| self.free[i]).collect();
+        self.scroll.take_columns(evidence, self.waiting.iter().chain(&self.gone));
+        let first_mm = self.scroll.first_mm();
+        self.gone.retain(|face| face.rectangle.trailing_mm() < first_mm);
+        for (members, height_mm) in self.scroll.beginnings(end_mm == f64::NEG_INFINITY) {
+            let members = self.scroll.free_of(members);
             if members.len() < CELLS_MIN {
                 continue;
             }
             let found = self.face(&members, height_mm, views);
-            for &i in &members {
-                self.free[i] = false;
-            }
-            if let Some(face) = found.filter(&is_raised) {
-                self.claim(&face);
+            self.scroll.take(&members);
+            if let Some(face) = found.and_then(|found| self.parcel(views, &found, &fit)) {
+                self.scroll.claim(&face);
                 self.keep(&face);
             }
         }
-        let (passed, waiting): (Vec<Face>, Vec<Face>) =
-            self.waiting.drain(..).partition(|face| face.rectangle.trailing_mm() > end_mm);
-        self.waiting = waiting;
+        let has_passed = |face: &mut Face| face.rectangle.trailing_mm() > end_mm;
+        let mut passed: Vec<Face> = self.waiting.extract_if(.., has_passed).collect();
+        let known = self.waiting.iter().chain(&self.gone).chain(&passed);
+        for members in self.scroll.left_over(&known, end_mm) {
+            passed.extend(self.enclose(views, &members));
+        }
         self.gone.extend(&passed);
         passed
     }
 
-    /// Columns decided since the last time; old ones go.
-    fn take_columns(&mut self, evidence: &Evidence) {
-        let decided = evidence.decided();
-        if decided.start > self.first {
-            let gone = ((decided.start - self.first) as usize * self.rows).min(self.cells.len());
-            self.cells.drain(..gone);
-            self.free.drain(..gone);
-            self.first = decided.start;
-            let first_mm = -(self.first as f64) * self.cell_mm;
-            self.gone.retain(|face| face.rectangle.trailing_mm() < first_mm);
-        }
-        let known = self.first + (self.cells.len() / self.rows) as i64;
-        for column in known..decided.end {
-            self.cells.extend(evidence.column(column));
-            self.free.extend(evidence.column(column).iter().map(Self::tells));
-        }
-        let fresh = (known - self.first).max(0) as usize * self.rows;
-        for face in self.waiting.iter().chain(&self.gone) {
-            for i in fresh..self.cells.len() {
-                let (x_mm, y_mm) = self.place_mm(i);
-                self.free[i] &= !owns(face, &self.cells[i], x_mm, y_mm);
-            }
-        }
-    }
-
-    /// Whether a cell tells a height.
-    fn tells(cell: &Cell) -> bool {
-        cell.strength > 0.0
-            && cell.height_mm > HEIGHT_MIN_MM
-            && cell.possible_mm[1] - cell.possible_mm[0] < NARROW_MM
-    }
-
-    /// X less travel, and Y, of a cell's middle.
-    fn place_mm(&self, i: usize) -> (f64, f64) {
-        let column = self.first + (i / self.rows) as i64;
-        (-(column as f64) * self.cell_mm, self.row_0_mm - (i % self.rows) as f64 * self.cell_mm)
-    }
-
-    /// Groups of neighbouring free cells of one height that are whole, and their heights, largest first.
-    /// What lies beside a larger group waits for that one.
-    fn beginnings(&self, ended: bool) -> Vec<(Vec<usize>, f64)> {
-        let columns = self.cells.len() / self.rows;
-        let usable =
-            |i: &usize| self.free[*i] && self.cells[*i].possible_mm[1] < self.height_max_mm;
-        let free: Vec<usize> = (0..self.cells.len()).filter(usable).collect();
-        let count = ((self.height_max_mm - HEIGHT_MIN_MM) / PLANE_STEP_MM) as usize;
-        let mut groups: Vec<Vec<usize>> = Vec::new();
-        let mut here = vec![false; self.cells.len()];
-        for k in 0..count {
-            let height_mm = HEIGHT_MIN_MM + 1.0 + PLANE_STEP_MM * k as f32;
-            for &i in &free {
-                here[i] = (self.cells[i].height_mm - height_mm).abs() <= TOLERANCE_MM;
-            }
-            for &start in &free {
-                if here[start] {
-                    let members = self.connected(start, &mut here);
-                    if members.len() >= CELLS_MIN {
-                        groups.push(members);
-                    }
-                }
-            }
-        }
-        groups.sort_by_key(|members| std::cmp::Reverse(members.len()));
-        // What still reaches the newest columns is not whole.
-        let is_whole = |members: &[usize]| {
-            ended || members.iter().all(|i| i / self.rows + WAIT_COLUMNS < columns)
-        };
-        let extent = |members: &[usize]| {
-            let start = [usize::MAX, 0, usize::MAX, 0];
-            members.iter().fold(start, |[a, b, c, d], i| {
-                let (column, row) = (i / self.rows, i % self.rows);
-                [a.min(column), b.max(column), c.min(row), d.max(row)]
-            })
-        };
-        let mut waiting: Vec<[usize; 4]> = Vec::new();
-        let mut whole = Vec::new();
-        for members in groups {
-            let here = extent(&members);
-            let beside = |[a, b, c, d]: &[usize; 4]| {
-                *a <= here[1] + BESIDE_CELLS
-                    && here[0] <= b + BESIDE_CELLS
-                    && *c <= here[3] + BESIDE_CELLS
-                    && here[2] <= d + BESIDE_CELLS
-            };
-            if !is_whole(&members) || waiting.iter().any(beside) {
-                waiting.push(here);
-                continue;
-            }
-            let heights_mm = members.iter().map(|&i| f64::from(self.cells[i].height_mm));
-            let height_mm = middle_of(heights_mm);
-            whole.push((members, height_mm));
-        }
-        whole
-    }
-
-    /// Cells connected to one, taken out of `here`.
-    fn connected(&self, start: usize, here: &mut [bool]) -> Vec<usize> {
-        let columns = (self.cells.len() / self.rows) as i32;
-        let mut members = vec![start];
-        here[start] = false;
-        let mut next = 0;
-        while next < members.len() {
-            let (column, row) =
-                ((members[next] / self.rows) as i32, (members[next] % self.rows) as i32);
-            next += 1;
-            for c in (column - GAP).max(0)..=(column + GAP).min(columns - 1) {
-                for r in (row - GAP).max(0)..=(row + GAP).min(self.rows as i32 - 1) {
-                    let i = c as usize * self.rows + r as usize;
-                    if here[i] {
-                        here[i] = false;
-                        members.push(i);
-                    }
-                }
-            }
-        }
-        members
-    }
-
     /// The face that a beginning belongs to.
     fn face(&mut self, members: &[usize], height_mm: f64, views: &Views) -> Option<Face> {
-        let places: Vec<(f64, f64)> = members.iter().map(|&i| self.place_mm(i)).collect();
-        let extent = |of: fn(&(f64, f64)) -> f64| {
-            let start = [f64::INFINITY, f64::NEG_INFINITY];
-            places.iter().map(of).fold(start, |[a, b], v| [a.min(v), b.max(v)])
-        };
-        let around = [extent(|place| place.0), extent(|place| place.1)];
-        let inside = [middle_of(places.iter().map(|p| p.0)), middle_of(places.iter().map(|p| p.1))];
+        let places = [0, 1]
+            .map(|k| -> Vec<f64> { members.iter().map(|&i| self.scroll.place_mm(i)[k]).collect() });
+        let around = places.each_ref().map(|mm| {
+            mm.iter().fold([f64::INFINITY, f64::NEG_INFINITY], |[a, b], v| [a.min(*v), b.max(*v)])
+        });
+        let inside = places.map(|mut mm| place_of(&mut mm, 0.5));
         let mut best = self.rectangle(views, height_mm, around, inside)?;
         let mut top_mm = height_mm;
         for _ in 0..LOOKS {
@@ -339,17 +186,20 @@ impl Parcels {
                 None => break,
             }
         }
-        self.fine.fill(views, top_mm, border_of(&best, NEAR_MM));
-        let narrower = self.search.narrower(&self.fine.stack, &best);
-        let weakest = best.sides.iter().copied().fold(1.0, f64::min);
-        let is_face = best.support() >= SUPPORT_MIN && weakest >= SIDE_SUPPORT_MIN;
-        is_face.then_some(Face {
-            rectangle: best,
-            narrower,
-            height_mm: top_mm,
-            cells: members.len(),
-            stacked: false,
-        })
+        is_border(&best).then(|| self.with_rivals(views, best, top_mm, members.len()))
+    }
+
+    /// A face with the borders further inside that may be its own, too.
+    fn with_rivals(
+        &mut self,
+        views: &Views,
+        rectangle: Rectangle,
+        height_mm: f64,
+        cells: usize,
+    ) -> Face {
+        self.fine.fill(views, height_mm, border_of(&rectangle, NEAR_MM));
+        let narrower = self.search.narrower(&self.fine.stack, &rectangle);
+        Face { rectangle, narrower, height_mm, cells, is_cuboid: false }
     }
 
     /// The plane on which a border is sharpest, and the border there.
@@ -359,7 +209,7 @@ impl Parcels {
             let from_mm = top_mm;
             for offset_mm in offsets_mm {
                 let trial_mm = from_mm + offset_mm;
-                if !(f64::from(HEIGHT_MIN_MM)..f64::from(self.height_max_mm)).contains(&trial_mm) {
+                if !(f64::from(HEIGHT_MIN_MM)..self.height_max_mm).contains(&trial_mm) {
                     continue;
                 }
                 self.fine.fill(views, trial_mm, border_of(&best, NEAR_MM));
@@ -414,50 +264,87 @@ impl Parcels {
         best
     }
 
-    /// The cells of a face are free no more.
-    fn claim(&mut self, face: &Face) {
-        for i in 0..self.cells.len() {
-            let (x_mm, y_mm) = self.place_mm(i);
-            self.free[i] &= !owns(face, &self.cells[i], x_mm, y_mm);
+    /// What a border found belongs to, by its edges and the cells within: a cuboid's top face, or a thing without
+    /// one. A bag's outline lies on the belt, a stack's is that of its lower part.
+    fn parcel(
+        &mut self,
+        views: &Views,
+        found: &Face,
+        fit: impl Fn(&Face) -> Option<Cuboid>,
+    ) -> Option<Face> {
+        let content = self.scroll.content(found);
+        if let Some(cuboid) = fit(found) {
+            let (rectangle, height_mm) = (cuboid.rectangle, cuboid.height_mm);
+            let fitted = Face { rectangle, height_mm, is_cuboid: true, ..*found };
+            if cuboid.is_box && self.scroll.content(&fitted).is_top() {
+                return Some(fitted);
+            }
+            if content.is_top() {
+                return Some(self.widened(views, found, &content));
+            }
         }
+        content.is_heap().then(|| self.widened(views, found, &content))
     }
 
-    /// Keep a face beside those that wait: of those at one place the best, or a stack.
+    /// A thing without a top face: it is as high as what is raised within, and each side is where the edges are at the
+    /// height of the cells there: a tube is widest at half its height.
+    fn widened(&mut self, views: &Views, found: &Face, content: &Content) -> Face {
+        let around = found.rectangle.shrunk(-enclosing::REACH_MM);
+        let cells = self.scroll.raised_within(&around);
+        let sides = Side::all(&around).map(|side| self.side_excess_mm(views, &side, &cells));
+        let excess_mm = sides.map(|found| found.unwrap_or(enclosing::REACH_MM));
+        let rectangle = around.moved_in(excess_mm, found.rectangle.sides);
+        Face { rectangle, height_mm: content.highest_mm, ..*found }
+    }
+
+    /// How far a side is outside of its outermost line of edges, at the height of the cells (X less the belt's travel,
+    /// Y, height) there.
+    fn side_excess_mm(
+        &mut self,
+        views: &Views,
+        side: &Side<'_>,
+        cells: &[[f64; 3]],
+    ) -> Option<f64> {
+        let here = cells.iter().filter(|[x_mm, y_mm, _]| side.has([*x_mm, *y_mm]));
+        let mut heights_mm: Vec<f64> = here.map(|cell| cell[2]).collect();
+        let height_mm = place_of(&mut heights_mm, 0.5);
+        self.fine.fill(views, height_mm, border_of(side.rectangle(), enclosing::REACH_MM));
+        side.excess_mm(self.fine.stack.edges(), self.fine.stack.px_mm())
+    }
+
+    /// What encloses cells that are raised in one piece, if they are around it on all sides.
+    fn enclose(&mut self, views: &Views, members: &[usize]) -> Option<Face> {
+        let cells: Vec<[f64; 3]> = members.iter().map(|&i| self.scroll.cell_mm(i)).collect();
+        let points: Vec<[f64; 2]> = cells.iter().map(|[x_mm, y_mm, _]| [*x_mm, *y_mm]).collect();
+        let around = enclosing::smallest_rectangle(&points);
+        let sides = Side::all(&around);
+        let excess_mm = sides
+            .each_ref()
+            .map(|side| self.side_excess_mm(views, side, &cells).unwrap_or(enclosing::SPREAD_MM));
+        let covered = sides.each_ref().map(|side| side.covered(&points, self.scroll.side_mm()));
+        let rectangle = around.moved_in(excess_mm, covered);
+        let mut heights_mm: Vec<f64> = cells.iter().map(|cell| cell[2]).collect();
+        let height_mm = place_of(&mut heights_mm, HIGHEST_SHARE);
+        let narrower = [None; 4];
+        let face = Face { rectangle, narrower, height_mm, cells: members.len(), is_cuboid: false };
+        let is_wide = rectangle.length_mm.min(rectangle.width_mm) > SIDE_MIN_MM;
+        let is_thing = is_wide && is_border(&rectangle) && !self.scroll.content(&face).is_belt();
+        is_thing.then_some(face)
+    }
+
+    /// Keep a face beside those that wait: of those at one place the best.
     fn keep(&mut self, face: &Face) {
-        let same = |other: &Face| {
-            face.rectangle.share_inside(&other.rectangle) > OVERLAP_SHARE
-                || other.rectangle.share_inside(&face.rectangle) > OVERLAP_SHARE
-        };
+        let same = |other: &Face| face.excludes(other);
         if self.gone.iter().any(same) {
             return;
         }
-        let (rivals, others): (Vec<Face>, Vec<Face>) = self.waiting.drain(..).partition(same);
-        self.waiting = others;
-        if let [rival] = rivals[..]
-            && let Some(stack) = stacked(face, &rival)
-        {
-            self.waiting.push(stack);
-        } else if worth(face) > rivals.iter().map(worth).sum() {
+        let rivals: Vec<Face> = self.waiting.extract_if(.., |other| same(other)).collect();
+        if face.worth() > rivals.iter().map(Face::worth).sum() {
             self.waiting.push(*face);
         } else {
             self.waiting.extend(rivals);
         }
     }
-}
-
-/// What a face explains: its border beyond what an accident has.
-fn worth(face: &Face) -> f64 {
-    let border_mm = 2.0 * (face.rectangle.length_mm + face.rectangle.width_mm);
-    (face.rectangle.support() - ACCIDENT_SUPPORT) * border_mm
-}
-
-/// A stack, if one of two faces lies on the other.
-fn stacked(one: &Face, other: &Face) -> Option<Face> {
-    let (low, high) = if one.height_mm < other.height_mm { (one, other) } else { (other, one) };
-    let on_top = high.height_mm - low.height_mm > STEP_MM
-        && high.rectangle.share_inside(&low.rectangle) > 0.9
-        && low.rectangle.support().min(high.rectangle.support()) > STACK_SUPPORT;
-    on_top.then_some(Face { height_mm: high.height_mm, stacked: true, ..*low })
 }
 
 /// A rectangle's extent and a margin: x and y, lowest and highest.
@@ -468,14 +355,11 @@ fn border_of(rectangle: &Rectangle, margin_mm: f64) -> [[f64; 2]; 2] {
     [around(rectangle.x_mm, rectangle.reach_mm()), around(rectangle.y_mm, y_reach_mm)]
 }
 
-/// Whether a cell belongs to a face: on it, or lower and beside it.
-fn owns(face: &Face, cell: &Cell, x_mm: f64, y_mm: f64) -> bool {
-    f64::from(cell.height_mm) < face.height_mm + STEP_MM
-        && face.rectangle.outside_mm(x_mm, y_mm) < SIDE_MM
-}
-
-fn middle_of(values: impl Iterator<Item = f64>) -> f64 {
-    let mut sorted: Vec<f64> = values.collect();
-    sorted.sort_by(f64::total_cmp);
-    sorted[sorted.len() / 2]
+/// The value below which a share of them lies; 0 if there are none.
+fn place_of(values: &mut [f64], share: f64) -> f64 {
+    let place = (share * values.len() as f64) as usize;
+    if values.is_empty() {
+        return 0.0;
+    }
+    *values.select_nth_unstable_by(place.min(values.len() - 1), f64::total_cmp).1
 }

@@ -23,6 +23,8 @@ pub const CROP_MM: f64 = 12.0;
 const NEAR_TURNS_DEG: [f32; 3] = [-0.4, 0.0, 0.4];
 /// Peaks of direction are this far apart, half degrees.
 const DIRECTIONS_APART: usize = 8;
+/// A stronger edge tells no more of the direction.
+const STRENGTH_MAX: f32 = 0.1;
 /// Edges count for the direction with this distance from the middle, mm.
 const DIRECTION_REACH_MM: f32 = 150.0;
 /// Bins of the direction within a quarter turn: half degrees.
@@ -96,6 +98,29 @@ impl Rectangle {
     pub fn reach_mm(&self) -> f64 {
         let (sin, cos) = self.yaw.sin_cos();
         0.5 * (self.length_mm * cos.abs() + self.width_mm * sin.abs())
+    }
+
+    /// Each side further inside by this, mm; outside if negative.
+    #[must_use]
+    pub fn shrunk(&self, by_mm: f64) -> Self {
+        let shrink = |length_mm: f64| (length_mm - 2.0 * by_mm).max(0.0);
+        Self { length_mm: shrink(self.length_mm), width_mm: shrink(self.width_mm), ..*self }
+    }
+
+    /// Its front, back, left and right side each further inside by so much, mm; `sides`: share of each that is edge.
+    #[must_use]
+    pub fn moved_in(&self, by_mm: [f64; 4], sides: [f64; 4]) -> Self {
+        let (sin, cos) = self.yaw.sin_cos();
+        let [front, back, left, right] = by_mm;
+        let (along, across) = (0.5 * (back - front), 0.5 * (right - left));
+        Self {
+            x_mm: self.x_mm + cos * along - sin * across,
+            y_mm: self.y_mm + sin * along + cos * across,
+            length_mm: (self.length_mm - front - back).max(0.0),
+            width_mm: (self.width_mm - left - right).max(0.0),
+            sides,
+            ..*self
+        }
     }
 
     /// Share of this rectangle that lies inside another, by a grid of points.
@@ -479,7 +504,8 @@ fn directions(stack: &Stack, inside_mm: [f32; 2]) -> [Option<f32>; DIRECTIONS] {
         let [dx, dy] = [edge.at_mm[0] - inside_mm[0], edge.at_mm[1] - inside_mm[1]];
         let distance = (dx * dx + dy * dy) / (DIRECTION_REACH_MM * DIRECTION_REACH_MM);
         let degrees = edge.step[1].atan2(edge.step[0]).to_degrees().rem_euclid(90.0);
-        counts[(2.0 * degrees) as usize % BINS] += edge.weight * (-0.5 * distance).exp();
+        counts[(2.0 * degrees) as usize % BINS] +=
+            edge.strength.min(STRENGTH_MAX) * (-0.5 * distance).exp();
     }
     let smooth: [f32; BINS] = std::array::from_fn(|i| {
         (0..9).map(|d| SMOOTH[d] * counts[(i + BINS + d - 4) % BINS]).sum()

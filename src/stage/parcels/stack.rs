@@ -8,6 +8,9 @@
 use super::steps::{STEP_ONE, Scale, StepPicture, Steps};
 use crate::camera::BeltView;
 use crate::error::Result;
+use crate::kernel::Level;
+use crate::kernel::scalar::semblance::{StepRow, StepSums};
+use crate::kernel::simd::semblance::add_steps;
 use crate::plan::{Block, Memory, Plan};
 use crate::stage::evidence::DARK_GREY;
 use crate::stage::views::Views;
@@ -29,8 +32,12 @@ const VIEWS_MIN: u16 = 6;
 const CLASS_LOG: f32 = 0.15;
 /// ... from 0 + [`DARK_GREY`] to 255.
 const CLASSES: usize = 28;
-/// Noise is told from the quietest quarter of the pixels of a brightness.
+/// Noise is told from the quietest quarter of the pixels of a brightness, ...
 const QUIET_SHARE: f32 = 0.25;
+/// ... of which every third is looked at.
+const NOISE_EVERY_PX: usize = 3;
+/// Fewer of a brightness tell none.
+const NOISE_PX_MIN: u32 = 17;
 /// Bins of energy, four to a factor of two, from 2^-24 on.
 const ENERGY_BINS: usize = 128;
 
@@ -52,8 +59,8 @@ pub struct EdgePixel {
     pub at_mm: [f32; 2],
     /// Unit vector of the step, dark to bright.
     pub step: [f32; 2],
-    /// How much it counts where directions are sought.
-    pub weight: f32,
+    /// How large the step is, as a logarithm.
+    pub strength: f32,
     /// How well the views agree on it: 0 hardly, 1 wholly.
     pub agreement: f32,
 }
@@ -72,8 +79,10 @@ pub struct Stack {
     origin_mm: [f64; 2],
     /// Logarithm of the grey values 0 to 255.
     log_of: [f32; 256],
+    level: Level,
     /// Sums over the views: steps, their squared length, grey values, and how many views.
-    steps: Block<[i16; 2]>,
+    along: Block<i16>,
+    across: Block<i16>,
     energy: Block<i32>,
     grey: Block<u16>,
     views: Block<u16>,
@@ -89,7 +98,8 @@ fn size_max(view: &BeltView, scale: Scale, zone: &BeltRect, height_max_mm: f64) 
     [count(WINDOW_MAX_MM), count(zone.y_max_mm - zone.y_min_mm)]
 }
 
-const STEPS: [&str; 2] = ["stack.steps", "coarse_stack.steps"];
+const ALONG: [&str; 2] = ["stack.along", "coarse_stack.along"];
+const ACROSS: [&str; 2] = ["stack.across", "coarse_stack.across"];
 const ENERGY: [&str; 2] = ["stack.energy", "coarse_stack.energy"];
 const GREY: [&str; 2] = ["stack.grey", "coarse_stack.grey"];
 const VIEWS: [&str; 2] = ["stack.views", "coarse_stack.views"];
@@ -106,7 +116,8 @@ impl Stack {
     ) {
         let [columns, rows] = size_max(view, scale, zone, height_max_mm);
         let n = columns * rows;
-        plan.add::<[i16; 2]>(scale.name(STEPS), n, "a window's steps, summed over the views");
+        plan.add::<i16>(scale.name(ALONG), n, "a window's steps along X, summed over the views");
+        plan.add::<i16>(scale.name(ACROSS), n, "the same along Y");
         plan.add::<i32>(scale.name(ENERGY), n, "their squares");
         plan.add::<u16>(scale.name(GREY), n, "its grey values");
         plan.add::<u16>(scale.name(VIEWS), n, "how many views show it");
@@ -118,6 +129,7 @@ impl Stack {
         view: &BeltView,
         scale: Scale,
         zone: &BeltRect,
+        level: Level,
         memory: &mut Memory,
     ) -> Result<Self> {
         let (side_px, picture_px) = scale.sizes(view);
@@ -131,7 +143,9 @@ impl Stack {
             rows: 0,
             origin_mm: [0.0; 2],
             log_of: std::array::from_fn(|grey| (grey as f32 + DARK_GREY).ln()),
-            steps: memory.take(scale.name(STEPS), [0; 2])?,
+            level,
+            along: memory.take(scale.name(ALONG), 0)?,
+            across: memory.take(scale.name(ACROSS), 0)?,
             energy: memory.take(scale.name(ENERGY), 0)?,
             grey: memory.take(scale.name(GREY), 0)?,
             views: memory.take(scale.name(VIEWS), 0)?,
@@ -160,9 +174,9 @@ impl Stack {
         }
     }
 
-    /// Stack the views on a window, cut to the zone's width and to what there is memory for. `usable`: of a
-    /// picture's pixels, those that tell of the belt.
-    pub fn fill(&mut self, views: &Views, steps: &Steps, usable: &[bool], window: &Window) {
+    /// Stack the views on a window, cut to the zone's width and to what there is memory for. `usable`: 255 for
+    /// a picture's pixels that tell of the belt, else 0.
+    pub fn fill(&mut self, views: &Views, steps: &Steps, usable: &[u8], window: &Window) {
         let m = self.geometry.magnification(window.height_mm);
         self.px_mm = self.side_px as f64 * self.geometry.mm_per_px / m;
         let y_max_mm = window.y_mm[1].min(self.zone.y_max_mm);
@@ -174,7 +188,8 @@ impl Stack {
         self.rows = count(y_max_mm - y_min_mm).min(rows_max);
         self.origin_mm = [window.x_mm[0], y_max_mm];
         let n = self.columns * self.rows;
-        self.steps[..n].fill([0; 2]);
+        self.along[..n].fill(0);
+        self.across[..n].fill(0);
         self.energy[..n].fill(0);
         self.grey[..n].fill(0);
         self.views[..n].fill(0);
@@ -189,7 +204,7 @@ impl Stack {
     }
 
     /// Add one view: on the plane its pixels are the window's, moved by whole pixels to the nearest.
-    fn add(&mut self, picture: StepPicture<'_>, usable: &[bool], travel_mm: f64, m: f64) {
+    fn add(&mut self, picture: StepPicture<'_>, usable: &[u8], travel_mm: f64, m: f64) {
         let view = &self.geometry;
         let x_mm = view.nadir.x + m * (self.origin_mm[0] + travel_mm - view.nadir.x);
         let y_mm = view.nadir.y + m * (self.origin_mm[1] - view.nadir.y);
@@ -215,15 +230,20 @@ impl Stack {
             let from = (j * width + i0 + first) as usize..(j * width + i0 + end) as usize;
             let to = row as usize * self.columns + first as usize
                 ..row as usize * self.columns + end as usize;
-            add_row(
-                &picture.steps[from.clone()],
-                &picture.grey[from.clone()],
-                &usable[from],
-                &mut self.steps[to.clone()],
-                &mut self.energy[to.clone()],
-                &mut self.grey[to.clone()],
-                &mut self.views[to],
-            );
+            let row = StepRow {
+                along: &picture.along[from.clone()],
+                across: &picture.across[from.clone()],
+                grey: &picture.grey[from.clone()],
+                usable: &usable[from],
+            };
+            let mut sums = StepSums {
+                along: &mut self.along[to.clone()],
+                across: &mut self.across[to.clone()],
+                energy: &mut self.energy[to.clone()],
+                grey: &mut self.grey[to.clone()],
+                views: &mut self.views[to],
+            };
+            add_steps(self.level, row, &mut sums);
         }
     }
 
@@ -233,17 +253,19 @@ impl Stack {
         for row in 0..self.rows {
             for column in 0..self.columns {
                 let i = row * self.columns + column;
-                if self.views[i] < VIEWS_MIN {
+                let n = f32::from(self.views[i]);
+                let [x, y] = [f32::from(self.along[i]), f32::from(self.across[i])];
+                let least = n * STEP_MIN * STEP_ONE;
+                if self.views[i] < VIEWS_MIN || x * x + y * y < least * least {
                     continue;
                 }
-                let n = f32::from(self.views[i]);
-                let [x, y] = self.steps[i].map(|sum| f32::from(sum) / (n * STEP_ONE));
+                let [x, y] = [x, y].map(|sum| sum / (n * STEP_ONE));
                 let energy = self.energy[i] as f32 / (n * STEP_ONE * STEP_ONE);
                 let noise = noise_at(&noise, self.log_at(i));
                 let common = x * x + y * y;
                 let semblance = (common - noise / n) / (energy - noise).max(0.15 * energy);
                 let beyond_noise = common * n > STEP_SIGMA_MIN * STEP_SIGMA_MIN * noise;
-                if semblance < SEMBLANCE_MIN || !beyond_noise || common < STEP_MIN * STEP_MIN {
+                if semblance < SEMBLANCE_MIN || !beyond_noise {
                     continue;
                 }
                 let strength = common.sqrt();
@@ -253,7 +275,7 @@ impl Stack {
                         (self.origin_mm[1] - row as f64 * self.px_mm) as f32,
                     ],
                     step: [x / strength, y / strength],
-                    weight: strength.min(0.1),
+                    strength,
                     agreement: ((semblance - SEMBLANCE_MIN) / (SEMBLANCE_WHOLE - SEMBLANCE_MIN))
                         .min(1.0),
                 };
@@ -270,7 +292,7 @@ impl Stack {
     /// Energy of noise in each class of brightness.
     fn noise(&self) -> [f32; CLASSES] {
         let mut counts = [[0u32; ENERGY_BINS]; CLASSES];
-        for i in 0..self.columns * self.rows {
+        for i in (0..self.columns * self.rows).step_by(NOISE_EVERY_PX) {
             if self.views[i] >= VIEWS_MIN {
                 let energy =
                     self.energy[i] as f32 / (f32::from(self.views[i]) * STEP_ONE * STEP_ONE);
@@ -279,7 +301,7 @@ impl Stack {
         }
         let mut noise = counts.map(|counts| {
             let all: u32 = counts.iter().sum();
-            if all < 50 {
+            if all < NOISE_PX_MIN {
                 return f32::NAN;
             }
             let quiet = (QUIET_SHARE * all as f32) as u32;
@@ -321,33 +343,6 @@ impl Seen<'_> {
             && (column as usize) < columns
             && (row as usize) < rows
             && self.views[row as usize * columns + column as usize] >= VIEWS_MIN
-    }
-}
-
-/// Add a view's pixels to the sums.
-fn add_row(
-    steps: &[[i8; 2]],
-    grey: &[u8],
-    usable: &[bool],
-    step_sums: &mut [[i16; 2]],
-    energies: &mut [i32],
-    grey_sums: &mut [u16],
-    views: &mut [u16],
-) {
-    let sums = step_sums.iter_mut().zip(energies).zip(grey_sums).zip(views);
-    for (((step, (&grey, &usable)), ((step_sum, energy), grey_sum)), views) in steps
-        .iter()
-        .zip(grey.iter().zip(usable))
-        .zip(sums)
-        .map(|(from, (to, views))| ((from, to), views))
-    {
-        let counts = i16::from(usable && grey > 0);
-        let [x, y] = step.map(|step| counts * i16::from(step));
-        step_sum[0] += x;
-        step_sum[1] += y;
-        *energy += i32::from(x) * i32::from(x) + i32::from(y) * i32::from(y);
-        *grey_sum += counts as u16 * u16::from(grey);
-        *views += counts as u16;
     }
 }
 

@@ -49,125 +49,166 @@ impl Scale {
 /// The steps of one view.
 #[derive(Clone, Copy)]
 pub struct StepPicture<'a> {
-    /// Along X and along Y, from dark to bright, in units of 1 / [`STEP_ONE`].
-    pub steps: &'a [[i8; 2]],
-    /// Grey values; 0: not known.
+    /// Along X, from dark to bright, in units of 1 / [`STEP_ONE`].
+    pub along: &'a [i8],
+    /// Along Y.
+    pub across: &'a [i8],
+    /// Grey values.
     pub grey: &'a [u8],
 }
 
+const LOG_OF_SUM: [&str; 2] = ["steps.log_of_sum", "coarse_steps.log_of_sum"];
 const LOG: [&str; 2] = ["steps.log", "coarse_steps.log"];
 const SLOW: [&str; 2] = ["steps.slow", "coarse_steps.slow"];
-const STEPS: [&str; 2] = ["steps.steps", "coarse_steps.steps"];
+const SCRATCH: [&str; 2] = ["steps.scratch", "coarse_steps.scratch"];
+const SEEN: [&str; 2] = ["steps.seen", "coarse_steps.seen"];
+const ALONG: [&str; 2] = ["steps.along", "coarse_steps.along"];
+const ACROSS: [&str; 2] = ["steps.across", "coarse_steps.across"];
 const GREY: [&str; 2] = ["steps.grey", "coarse_steps.grey"];
 
 /// The stage.
 pub struct Steps {
     /// Pixels of the view to a side of a picture's.
     side_px: usize,
-    view_px: [usize; 2],
     size_px: [usize; 2],
-    /// Logarithm of the grey values 0 to 255.
-    log_of: [f32; 256],
+    /// Logarithms of the mean, by the sum of a pixel's grey values.
+    log_of_sum: Block<f32>,
     log: Block<f32>,
     slow: Block<f32>,
-    steps: Block<[i8; 2]>,
+    scratch: Block<f32>,
+    seen: Block<u8>,
+    along: Block<i8>,
+    across: Block<i8>,
     grey: Block<u8>,
 }
 
 impl Steps {
     /// Memory for a view.
     pub fn plan(view: &BeltView, scale: Scale, plan: &mut Plan) {
-        let (_, [width, height]) = scale.sizes(view);
+        let (side_px, [width, height]) = scale.sizes(view);
         let n = width * height;
+        plan.add::<f32>(scale.name(LOG_OF_SUM), 255 * side_px * side_px + 1, "logarithms");
         plan.add::<f32>(scale.name(LOG), n, "logarithm of one view");
         plan.add::<f32>(scale.name(SLOW), n, "its slow part");
-        plan.add::<[i8; 2]>(scale.name(STEPS), n * VIEWS_MAX, "steps of each view kept");
+        plan.add::<f32>(scale.name(SCRATCH), n, "the other half of each smoothing");
+        plan.add::<u8>(scale.name(SEEN), n, "pixels that the camera sees with all around");
+        plan.add::<i8>(scale.name(ALONG), n * VIEWS_MAX, "steps along X of each view kept");
+        plan.add::<i8>(scale.name(ACROSS), n * VIEWS_MAX, "steps along Y of each view kept");
         plan.add::<u8>(scale.name(GREY), n * VIEWS_MAX, "grey values to them");
     }
 
-    /// None yet.
-    pub fn new(view: &BeltView, scale: Scale, memory: &mut Memory) -> Result<Self> {
+    /// None yet. `seen`: bit mask of the view's pixels that the camera sees.
+    pub fn new(view: &BeltView, scale: Scale, seen: &[u64], memory: &mut Memory) -> Result<Self> {
         let (side_px, size_px) = scale.sizes(view);
-        Ok(Self {
+        let mut log_of_sum = memory.take(scale.name(LOG_OF_SUM), 0.0)?;
+        let share = 1.0 / (side_px * side_px) as f32;
+        for (sum, log) in log_of_sum.iter_mut().enumerate() {
+            *log = (sum as f32 * share + DARK_GREY).ln();
+        }
+        let mut steps = Self {
             side_px,
-            view_px: view.size_px,
             size_px,
-            log_of: std::array::from_fn(|grey| (grey as f32 + DARK_GREY).ln()),
+            log_of_sum,
             log: memory.take(scale.name(LOG), 0.0)?,
             slow: memory.take(scale.name(SLOW), 0.0)?,
-            steps: memory.take(scale.name(STEPS), [0; 2])?,
+            scratch: memory.take(scale.name(SCRATCH), 0.0)?,
+            seen: memory.take(scale.name(SEEN), 0)?,
+            along: memory.take(scale.name(ALONG), 0)?,
+            across: memory.take(scale.name(ACROSS), 0)?,
             grey: memory.take(scale.name(GREY), 0)?,
-        })
+        };
+        steps.find_seen(words(view.size_px[0]), seen);
+        Ok(steps)
+    }
+
+    /// Of a picture's pixels, 255 for those that the camera sees with all that their steps are made from,
+    /// else 0.
+    fn find_seen(&mut self, words: usize, seen: &[u64]) {
+        let ([width, height], side) = (self.size_px, self.side_px);
+        // What is not seen spreads as it does in the steps: as NaN.
+        for j in 0..height {
+            for i in 0..width {
+                let row = |v: usize| &seen[v * words..][..words];
+                let mut pixels = (j * side..(j + 1) * side)
+                    .flat_map(|v| (i * side..(i + 1) * side).map(move |u| (u, v)));
+                let whole = pixels.all(|(u, v)| bits::get(row(v), u));
+                self.log[j * width + i] = if whole { 0.0 } else { f32::NAN };
+            }
+        }
+        self.take_out_slow_part();
+        for j in 1..height - 1 {
+            for i in 1..width - 1 {
+                let at = j * width + i;
+                let around = [at - 1, at + 1, at - width, at + width].map(|at| self.log[at]);
+                let known = around.iter().all(|log| !log.is_nan());
+                self.seen[at] = if known { u8::MAX } else { 0 };
+            }
+        }
+    }
+
+    /// Of a picture's pixels, 255 for those that the camera sees, else 0.
+    pub fn seen(&self) -> &[u8] {
+        &self.seen
     }
 
     /// The steps of the view at a place.
     pub fn picture(&self, place: usize) -> StepPicture<'_> {
         let n = self.size_px[0] * self.size_px[1];
-        StepPicture { steps: &self.steps[place * n..][..n], grey: &self.grey[place * n..][..n] }
+        let here = place * n..(place + 1) * n;
+        StepPicture {
+            along: &self.along[here.clone()],
+            across: &self.across[here.clone()],
+            grey: &self.grey[here],
+        }
     }
 
-    /// A view more. `seen`: bit mask of the view's pixels that the camera sees.
-    pub fn add(&mut self, grey: Plane<'_>, seen: &[u64], place: usize) {
-        self.take_logarithms(grey, seen, place);
-        self.find_slow_part();
+    /// A view more.
+    pub fn add(&mut self, grey: Plane<'_>, place: usize) {
+        self.take_logarithms(grey, place);
+        self.take_out_slow_part();
         let [width, height] = self.size_px;
-        for (log, slow) in self.log.iter_mut().zip(self.slow.iter()) {
-            *log -= slow;
-        }
         let n = width * height;
-        let steps = &mut self.steps[place * n..][..n];
-        let grey = &mut self.grey[place * n..][..n];
-        steps.fill([0; 2]);
-        for j in 0..height {
-            for i in 0..width {
-                let at = j * width + i;
-                let inside = i > 0 && j > 0 && i + 1 < width && j + 1 < height;
-                let step = inside.then(|| {
-                    let fine = &self.log;
-                    [fine[at + 1] - fine[at - 1], fine[at - width] - fine[at + width]]
-                });
-                match step.and_then(stored) {
-                    Some(step) => steps[at] = step,
-                    None => grey[at] = 0,
-                }
+        let along = &mut self.along[place * n..][..n];
+        let across = &mut self.across[place * n..][..n];
+        for j in 1..height - 1 {
+            let line = |j: usize| &self.log[j * width..][..width];
+            let [above, here, below] = [j - 1, j, j + 1].map(line);
+            let out = j * width + 1..(j + 1) * width - 1;
+            let inside = width - 2;
+            let (left, right) = (&here[..inside], &here[2..]);
+            let (above, below) = (&above[1..][..inside], &below[1..][..inside]);
+            let steps = along[out.clone()].iter_mut().zip(&mut across[out]);
+            for (i, (along, across)) in steps.enumerate() {
+                [*along, *across] = stored([right[i] - left[i], above[i] - below[i]]);
             }
         }
     }
 
-    /// Means over a picture's pixel, and their logarithms; NaN where one is not seen.
-    fn take_logarithms(&mut self, grey: Plane<'_>, seen: &[u64], place: usize) {
+    /// Means over a picture's pixel, and their logarithms.
+    fn take_logarithms(&mut self, grey: Plane<'_>, place: usize) {
         let ([width, height], side) = (self.size_px, self.side_px);
-        let n = words(self.view_px[0]);
-        for j in 0..height {
-            for i in 0..width {
-                let (mut sum, mut unseen) = (0u32, false);
+        let means = &mut self.grey[place * width * height..][..width * height];
+        let lines = means.chunks_exact_mut(width).zip(self.log.chunks_exact_mut(width));
+        for (j, (means, logs)) in lines.enumerate() {
+            for (i, (mean, log)) in means.iter_mut().zip(logs).enumerate() {
+                let mut sum = 0;
                 for v in j * side..(j + 1) * side {
-                    let here = i * side..(i + 1) * side;
-                    sum += grey.row(v)[here.clone()].iter().map(|&g| u32::from(g)).sum::<u32>();
-                    unseen |= here.into_iter().any(|u| !bits::get(&seen[v * n..][..n], u));
+                    let pixels = &grey.row(v)[i * side..(i + 1) * side];
+                    sum += pixels.iter().map(|&g| usize::from(g)).sum::<usize>();
                 }
-                let at = j * width + i;
-                let mean = sum as f32 / (side * side) as f32;
-                self.grey[place * width * height + at] = (mean as u8).max(1);
-                self.log[at] = match (unseen, side) {
-                    (true, _) => f32::NAN,
-                    (false, 1) => self.log_of[sum as usize],
-                    (false, _) => (mean + DARK_GREY).ln(),
-                };
+                *mean = (sum / (side * side)) as u8;
+                *log = self.log_of_sum[sum];
             }
         }
     }
 
-    fn find_slow_part(&mut self) {
-        let [width, height] = self.size_px;
+    fn take_out_slow_part(&mut self) {
         self.slow.copy_from_slice(&self.log);
         for _ in 0..PASSES {
-            for line in self.slow.chunks_exact_mut(width) {
-                box_filter(line, 1, width);
-            }
-            for column in 0..width {
-                box_filter(&mut self.slow[column..], width, height);
-            }
+            box_filter(&mut self.slow, &mut self.scratch, self.size_px[0]);
+        }
+        for (log, slow) in self.log.iter_mut().zip(self.slow.iter()) {
+            *log -= slow;
         }
     }
 }
@@ -177,13 +218,11 @@ pub const REACH_PX: usize = PASSES * box_filter::REACH;
 /// Times that the box filter is applied.
 const PASSES: usize = 2;
 
-fn stored([x, y]: [f32; 2]) -> Option<[i8; 2]> {
-    let length = STEP_ONE * x.hypot(y);
-    if length.is_nan() {
-        return None;
-    }
-    let scale = STEP_ONE * (STEP_MOST / length.max(STEP_MOST));
-    Some([x, y].map(|step| (scale * step).round() as i8))
+fn stored([x, y]: [f32; 2]) -> [i8; 2] {
+    let length = STEP_ONE * (x * x + y * y).sqrt();
+    let scale = STEP_ONE * STEP_MOST / length.max(STEP_MOST);
+    // Rounded to the nearest: a cast cuts off.
+    [x, y].map(|step| (scale * step + 0.5_f32.copysign(step)) as i32 as i8)
 }
 
 #[cfg(test)]
@@ -191,10 +230,8 @@ mod tests {
     use super::*;
 
     #[test]
-    fn a_step_is_stored_with_its_direction_however_long_and_what_is_unknown_is_none() {
-        assert_eq!(stored([0.1, -0.2]), Some([26, -51]));
-        let [x, y] = stored([3.0, 4.0]).expect("known");
-        assert_eq!([x, y], [76, 102], "of length 127");
-        assert_eq!(stored([f32::NAN, 0.0]), None);
+    fn a_step_is_stored_with_its_direction_however_long() {
+        assert_eq!(stored([0.1, -0.2]), [26, -51]);
+        assert_eq!(stored([3.0, 4.0]), [76, 102], "of length 127");
     }
 }

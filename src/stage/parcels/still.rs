@@ -23,7 +23,7 @@ pub struct Still {
     size_px: [usize; 2],
     median: Block<u8>,
     known: bool,
-    usable: Block<bool>,
+    usable: Block<u8>,
 }
 
 impl Still {
@@ -31,7 +31,7 @@ impl Still {
     pub fn plan(view: &BeltView, scale: Scale, plan: &mut Plan) {
         let (_, [width, height]) = scale.sizes(view);
         plan.add::<u8>(scale.name(MEDIAN), width * height, "what stands still");
-        plan.add::<bool>(scale.name(USABLE), width * height, "pixels without its edges");
+        plan.add::<u8>(scale.name(USABLE), width * height, "pixels without its edges");
     }
 
     /// Nothing seen.
@@ -41,34 +41,37 @@ impl Still {
             size_px,
             median: memory.take(scale.name(MEDIAN), 0)?,
             known: false,
-            usable: memory.take(scale.name(USABLE), true)?,
+            usable: memory.take(scale.name(USABLE), 0)?,
         })
     }
 
-    /// Pixels away from every edge of the still scene.
-    pub fn usable(&self) -> &[bool] {
+    /// 255 for pixels that are seen away from every edge of the still scene, else 0.
+    pub fn usable(&self) -> &[u8] {
         &self.usable
     }
 
-    /// The grey values of a view more; 0: not known.
-    pub fn add(&mut self, grey: &[u8]) {
-        for (median, &grey) in self.median.iter_mut().zip(grey) {
-            let step = i16::from(grey).cmp(&i16::from(*median)) as i8;
-            *median = if self.known { median.saturating_add_signed(step) } else { grey };
+    /// The grey values of a view more. `seen`: 255 for pixels that the camera sees, else 0.
+    pub fn add(&mut self, grey: &[u8], seen: &[u8]) {
+        if !self.known {
+            self.median.copy_from_slice(grey);
+            self.known = true;
         }
-        self.known = true;
-        self.usable.fill(true);
+        for (median, &grey) in self.median.iter_mut().zip(grey) {
+            *median = *median + u8::from(grey > *median) - u8::from(grey < *median);
+        }
+        self.usable.copy_from_slice(seen);
         let [width, height] = self.size_px;
         for v in 1..height.saturating_sub(1) {
             for u in 0..width {
                 // Only edges along the travel stay where they are on the belt, too.
-                let [above, below] = [v - 1, v + 1].map(|v| f32::from(self.median[v * width + u]));
-                let is_known = above > 0.0 && below > 0.0;
+                let [above, below] = [v - 1, v + 1].map(|v| v * width + u);
+                let is_known = seen[above] & seen[below] > 0;
+                let [above, below] = [above, below].map(|at| f32::from(self.median[at]));
                 let least = STEP_GREY.max(STEP_SHARE * (above + below));
                 if is_known && (above - below).abs() > least {
                     // As far as the slow part spreads it.
                     for v in v.saturating_sub(REACH_PX)..=(v + REACH_PX).min(height - 1) {
-                        self.usable[v * width + u] = false;
+                        self.usable[v * width + u] = 0;
                     }
                 }
             }

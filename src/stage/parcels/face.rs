@@ -1,0 +1,74 @@
+//! What a parcel shows from above, and how two such things exclude each other.
+
+use super::rectangle::Rectangle;
+use crate::stage::evidence::Cell;
+
+/// A border with less than this share of edge is an accident.
+const SUPPORT_MIN: f64 = 0.65;
+/// Each side has at least this share of edge.
+const SIDE_SUPPORT_MIN: f64 = 0.25;
+/// Lines that happen to lie right give this share.
+const ACCIDENT_SUPPORT: f64 = 0.55;
+/// Cells this far around a face are its own: its sides, mm.
+const SIDE_MM: f64 = 10.0;
+/// What encloses a bag is known to a few mm: two such faces are one parcel's when this share of one lies
+/// inside the other.
+const OVERLAP_SHARE: f64 = 0.3;
+/// Two cuboids that reach further into each other are one parcel's, mm.
+const CUBOID_DEPTH_MM: f64 = 5.0;
+/// What differs less in height is at one height, mm.
+pub const STEP_MM: f64 = 12.0;
+
+/// A parcel seen from above.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Face {
+    /// Its border.
+    pub rectangle: Rectangle,
+    /// For each side the border with a line further inside that may be it, too.
+    pub narrower: [Option<Rectangle>; 4],
+    /// Over the belt, mm.
+    pub height_mm: f64,
+    /// Cells that began it.
+    pub cells: usize,
+    /// A cuboid's top face, by its edges; else this is what encloses the parcel.
+    pub is_cuboid: bool,
+}
+
+/// A cuboid fitted to the edges around a face.
+#[derive(Clone, Copy, Debug)]
+pub struct Cuboid {
+    /// Its top face.
+    pub rectangle: Rectangle,
+    /// Over the belt, mm.
+    pub height_mm: f64,
+    /// Enough of the edges are a cuboid's.
+    pub is_box: bool,
+}
+
+impl Face {
+    /// What the face explains: its border beyond what an accident has.
+    pub fn worth(&self) -> f64 {
+        let border_mm = 2.0 * (self.rectangle.length_mm + self.rectangle.width_mm);
+        (self.rectangle.support() - ACCIDENT_SUPPORT) * border_mm
+    }
+
+    /// Whether a cell belongs to the face: on it, or lower and beside it.
+    pub fn owns(&self, cell: &Cell, [x_mm, y_mm]: [f64; 2]) -> bool {
+        f64::from(cell.height_mm) < self.height_mm + STEP_MM
+            && self.rectangle.outside_mm(x_mm, y_mm) < SIDE_MM
+    }
+
+    /// Whether two faces cannot be two parcels'.
+    pub fn excludes(&self, other: &Self) -> bool {
+        let both = self.is_cuboid && other.is_cuboid;
+        let [depth_mm, share] = if both { [CUBOID_DEPTH_MM, 0.0] } else { [0.0, OVERLAP_SHARE] };
+        let inside = |a: &Self, b: &Self| a.rectangle.shrunk(depth_mm).share_inside(&b.rectangle);
+        inside(self, other) > share || inside(other, self) > share
+    }
+}
+
+/// Whether enough of a border is edge.
+pub fn is_border(rectangle: &Rectangle) -> bool {
+    let weakest = rectangle.sides.iter().copied().fold(1.0, f64::min);
+    rectangle.support() >= SUPPORT_MIN && weakest >= SIDE_SUPPORT_MIN
+}
