@@ -4,6 +4,7 @@
 //! sequence number first and last, so that a client that reads it in two requests can tell whether
 //! it changed in between.
 
+use super::health::{Concern, HealthStatus};
 use super::journal::Keeping;
 use super::table::{Field, fields};
 use crate::config::WordOrder;
@@ -83,6 +84,8 @@ pub struct VisionStatus {
     pub counters: Counters,
     /// What is known of the belt beside its speed.
     pub belt: BeltStatus,
+    /// What the instrument knows of itself.
+    pub health: HealthStatus,
 }
 
 /// Ratios that command 6 corrects.
@@ -178,7 +181,7 @@ pub struct Status {
 }
 
 /// What is wrong or worth knowing: code and meaning.
-pub const REASONS: [(u16, &str); 21] = [
+pub const REASONS: [(u16, &str); 23] = [
     (0, "all is well"),
     (1, "the frame source has ended or failed"),
     (2, "no frames arrive"),
@@ -212,6 +215,8 @@ pub const REASONS: [(u16, &str); 21] = [
         20,
         "the archive: its disk fails or does not answer, entries were lost, or damage was found, since start; see the page",
     ),
+    (21, "the camera has moved a little: see camera_moved, camera_error; fasten it"),
+    (22, "the camera has moved so far that sizes and places are wrong: calibrate the belt again"),
 ];
 
 impl Status {
@@ -259,6 +264,7 @@ impl Status {
             self.vision.belt.hides_parcels,
             self.vision.frames_missing,
             self.vision.archive_fails,
+            self.vision.health.camera != Concern::None,
         ])
     }
 
@@ -280,11 +286,13 @@ impl Status {
             (6, self.encoder_silent),
             (15, self.vision.belt.encoder_disagrees),
             (16, self.vision.belt.not_as_configured),
+            (22, self.vision.health.camera == Concern::Fault),
             (7, self.plc_silent),
             (8, !self.vision.ready),
             (18, self.vision.belt.hides_parcels),
             (17, self.vision.belt.ambiguous),
             (19, self.vision.frames_missing),
+            (21, self.vision.health.camera == Concern::Warning),
             (9, self.stopped),
             (13, self.vision.import.result == IMPORT_REFUSED),
             (20, self.vision.archive_fails),
@@ -334,7 +342,7 @@ pub const STATUS_FIELDS: &[StatusField] = fields![
     [4, V1_0, "test_i16", I16, "", 1.0, "constant -12345: checks the sign", |_| -12345.0],
     [10, V1_0, "heartbeat", U16, "", 1.0, "rises ten times a second while frames arrive; wraps", |s| f64::from(s.heartbeat)],
     [11, V1_0, "status", U16, "bits", 1.0, "bit 0 running, bit 1 ready (belt learned), bit 2 belt motion measured, bit 3 by the encoder, bit 4 stopped by command, bit 5 PLC silent, bit 6 parcels wait to be acknowledged", |s| f64::from(s.status_bits())],
-    [12, V1_0, "fault", U16, "bits", 1.0, "bit 0 frame source ended, bit 1 a table has been full since start (see counters), bit 2 a parcel was never acknowledged, bit 3 CAN bus off or down, bit 4 encoder silent, bit 5 no camera, bit 6 the disk fails, bit 7 encoder and belt disagree, bit 8 the belt does not run as configured, bit 9 the belt hides parcels, bit 10 frames are missing, bit 11 the archive fails", |s| f64::from(s.fault_bits())],
+    [12, V1_0, "fault", U16, "bits", 1.0, "bit 0 frame source ended, bit 1 a table has been full since start (see counters), bit 2 a parcel was never acknowledged, bit 3 CAN bus off or down, bit 4 encoder silent, bit 5 no camera, bit 6 the disk fails, bit 7 encoder and belt disagree, bit 8 the belt does not run as configured, bit 9 the belt hides parcels, bit 10 frames are missing, bit 11 the archive fails, bit 12 the camera has moved", |s| f64::from(s.fault_bits())],
     [13, V1_0, "belt_speed", U32, "mm/s", 10.0, "belt speed", |s| s.vision.belt_speed_mm_per_s],
     [15, V1_0, "frames", U32, "", 1.0, "frames processed; wraps", |s| wrapped(s.vision.counters.frames)],
     [17, V1_0, "frames_dropped", U32, "", 1.0, "frames that came too late; wraps", |s| wrapped(s.vision.frames_dropped)],
@@ -368,6 +376,9 @@ pub const STATUS_FIELDS: &[StatusField] = fields![
     [72, V2_0, "encoder_ratio", I16, "", 10000.0, "the encoder's travel over the belt's, negative when it counts the other way; 0: not known, or it stands", |s| s.vision.belt.encoder_ratio.unwrap_or(0.0)],
     [73, V2_0, "mm_per_count", I32, "mm", 1_000_000.0, "belt travel of a count, as configured or set by command 6; 0: no encoder", |s| s.mm_per_count.unwrap_or(0.0)],
     [75, V2_0, "mm_per_count_seen", I32, "mm", 1_000_000.0, "the same as the belt's texture shows it; 0: not known", |s| s.mm_per_count_seen().unwrap_or(0.0)],
+    [77, V2_0, "camera_watch", U16, "", 1.0, "whether a camera that moves is seen: 0 what stands is being learned, 1 no: too little stands, 2 across travel alone, 3 along travel alone, 4 yes", |s| f64::from(s.vision.health.camera_watch)],
+    [78, V2_0, "camera_moved", U16, "px", 100.0, "how far the picture has moved since start", |s| s.vision.health.camera_moved_px],
+    [79, V2_0, "camera_error", U16, "mm", 100.0, "the largest error that it causes, of a place or of a dimension", |s| s.vision.health.camera_error_mm],
 ];
 
 /// What a PLC writes, from [`COMMAND`] on.
@@ -552,7 +563,7 @@ mod tests {
         assert_eq!(status.reason(), 3);
         assert!(status.reasons().eq([3, 6, 11]));
         let codes = REASONS.iter().map(|(code, _)| *code);
-        assert!(codes.eq(0..21));
+        assert!(codes.eq(0..23));
     }
 
     #[test]

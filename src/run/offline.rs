@@ -6,6 +6,7 @@ use super::{Annotator, memory};
 use crate::config::Site;
 use crate::error::{Error, Result};
 use crate::event::{Counters, ParcelRecord};
+use crate::health::{Condition, Level};
 use crate::image::Plane;
 use crate::pipeline::Pipeline;
 use crate::source::FrameSource;
@@ -103,6 +104,9 @@ pub fn measure(
             if let Some(doubt) = belt_doubt(&pipeline) {
                 observer.doubt(&doubt);
             }
+            if let Some(doubt) = condition_doubt(&pipeline.condition()) {
+                observer.doubt(&doubt);
+            }
             if let Some(explainer) = explainer {
                 explainer.finish(&pipeline)?;
             }
@@ -119,6 +123,17 @@ fn gap_doubt(frames: u64) -> Option<String> {
         format!(
             "the recording lacks {frames} frames, by the belt's steps: its travel was measured over them, but \
              times and speeds are wrong by as much: record without dropping frames"
+        )
+    })
+}
+
+/// What of the instrument is not as it was at the start of a recording.
+fn condition_doubt(condition: &Condition) -> Option<String> {
+    let moved = condition.place.moved;
+    (condition.place.level > Level::Good).then(|| {
+        format!(
+            "the camera has moved by {:.2} px: places or dimensions are wrong by up to {:.1} mm since then",
+            moved.picture_px, moved.error_mm
         )
     })
 }

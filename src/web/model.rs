@@ -81,6 +81,12 @@ pub struct CameraState {
     pub frames_torn: u64,
     /// The slowest frame in the pipeline.
     pub frame_time_max_ms: f64,
+    /// Whether it is seen when it moves: 0 being learned, 1 no, 2 across travel, 3 along travel, 4 yes.
+    pub watch: u16,
+    /// How far its picture has moved since start.
+    pub moved_px: f64,
+    /// The largest error that this causes.
+    pub moved_error_mm: f64,
 }
 
 /// The belt.

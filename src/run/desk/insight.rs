@@ -173,6 +173,9 @@ impl web::Machine for Insight {
                 frames_lost: vision.frames_lost,
                 frames_torn: vision.frames_torn,
                 frame_time_max_ms: frame_time_max.as_secs_f64() * 1e3,
+                watch: vision.health.camera_watch,
+                moved_px: vision.health.camera_moved_px,
+                moved_error_mm: vision.health.camera_error_mm,
             },
             belt: web::BeltState {
                 speed_mm_per_s: vision.belt_speed_mm_per_s,

@@ -63,6 +63,7 @@ function figuresOf(state) {
     ["figure.slowest", `${number(camera.frame_time_max_ms)} ms`],
     ["figure.camera", `${camera.size_px.join(" × ")} px`],
     ["figure.losses", count(camera.losses)],
+    ["figure.watch", camera.watch < 2 ? t(`figure.watch_${camera.watch}`) : `${number(camera.moved_px, 2)} px = ${number(camera.moved_error_mm, 2)} mm${t(`figure.watch_${camera.watch}`)}`],
   ];
   if (belt.encoder_ratio !== null) figures.push(["figure.encoder_ratio", number(belt.encoder_ratio, 4)]);
   figures.push(["figure.archive", archive.enabled ? t("figure.archive_used", { used: bytes(archive.bytes), most: bytes(archive.bytes_max) }) : t("figure.archive_none")]);
