@@ -44,6 +44,9 @@ const HOLD_MARGIN_PX: usize = 2;
 /// carry the parcel's own, faster motion into them.
 const COVER_MARGIN_PX: usize = 8;
 
+/// Parcels that pass the middle of the zone in one frame, and are looked at.
+const PASSING_MAX: usize = 4;
+
 /// What is narrower than this many px cannot be told from a sliver of shadow.
 const SIDE_MIN_PX: f64 = 4.0;
 /// A blob whose middle is this near to a parcel's silhouette is a piece of that parcel.
@@ -307,9 +310,16 @@ impl Pipeline {
 
     /// Whether the instrument is as it was.
     fn watch(&mut self, raw: Plane<'_>, step_mm: f64, dt_s: f64) {
+        let tops: heapless::Vec<_, PASSING_MAX> = self
+            .passing_middle()
+            .filter_map(|sight| sight.top(&self.site.view))
+            .take(PASSING_MAX)
+            .collect();
+        tops.iter().for_each(|top| self.watch.parcel(self.rectify.view(), top));
         let moves = !self.stands_still && step_mm != 0.0;
         let moving_s = moves.then_some(dt_s);
-        self.watch.step(&self.site, raw, Ride { travel_mm: self.at.travel_mm, moving_s });
+        let ride = Ride { covered: &self.covered, travel_mm: self.at.travel_mm, moving_s };
+        self.watch.step(&self.site, raw, ride);
     }
 
     /// Give blobs to tracks. A piece beside a measured cuboid (a side face as grey as the belt

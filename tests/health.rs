@@ -4,7 +4,7 @@ mod common;
 
 use beltgauge::config::{Config, Site};
 use beltgauge::error::Result;
-use beltgauge::health::{Condition, Level, Ride, Watch, Watching};
+use beltgauge::health::{Condition, Level, REGIONS, Ride, Watch, Watching};
 use beltgauge::image::{FrameTime, Plane};
 use beltgauge::plan::Plan;
 use beltgauge::plc::registers::Status;
@@ -64,7 +64,11 @@ impl Recording {
             let frame = &frames[if at < there { at } else { 2 * there - 1 - at }];
             let raw = Plane::packed(frame, width, height).expect("a frame");
             let travel_mm = k as f64 * self.step_mm;
-            watch.step(&self.site, raw, Ride { travel_mm, moving_s: Some(1.0 / self.fps) });
+            watch.step(
+                &self.site,
+                raw,
+                Ride { covered: &[], travel_mm, moving_s: Some(1.0 / self.fps) },
+            );
             let now = watch.condition();
             if told.last() != Some(&now) {
                 told.push(now);
@@ -124,7 +128,10 @@ fn nothing_is_told_of_recordings_in_which_nothing_is() {
         let last = told.last().expect("one");
         eprintln!("{name}: {last:?}");
         assert_eq!(last.place.watching, Watching::Both, "{name}");
-        assert!(told.iter().all(|now| now.place.level == Level::Good), "{name}");
+        for now in &told {
+            let levels = [now.place.level, now.sharpness.level, now.light.level];
+            assert_eq!(levels, [Level::Good; 3], "{name}: {now:?}");
+        }
     }
 }
 
@@ -228,9 +235,9 @@ const GANTRY: &str = "[[intruder]]\nfrom_s = 0\nto_s = 1e9\nvelocity_mm_per_s = 
 /// Run the appliance on it; all codes of each status that is new, and the last status.
 fn told(gantry: &str, change: fn(&[u8], [usize; 2]) -> Vec<u8>) -> (Vec<Vec<u16>>, Status) {
     let text = format!(
-        "seed = 3\nfps = 50\nframes = 2600\nexposure_ms = 1\n{}[belt]\n\
+        "seed = 3\nfps = 50\nframes = 2400\nexposure_ms = 1\n{}[belt]\n\
          speed_mm_per_s = 300\nwidth_mm = 800\ngrey = 45\ntexture_grey = 2\n{gantry}",
-        common::camera_above([384, 240], 270.0, 1200.0, [0.0; 5])
+        common::camera_above([768, 480], 540.0, 1200.0, [0.0; 5])
     );
     let config = "[camera]\ncalibration = \"the scenario's\"\n[belt]\nspeed_mm_per_s = 300\n\
          [zone]\nx_min_mm = -500\nx_max_mm = 500\ny_min_mm = -300\ny_max_mm = 300\n\
@@ -240,7 +247,7 @@ fn told(gantry: &str, change: fn(&[u8], [usize; 2]) -> Vec<u8>) -> (Vec<Vec<u16>
     let site = Site::new(Config::parse(config).expect("valid"), camera).expect("in view");
     let belt = Synthetic::new(scenario).expect("renders");
     // As it was again at the end.
-    let mut source = Changed { belt, frames: 1000..1800, change };
+    let mut source = Changed { belt, frames: 1000..1650, change };
     let mut feed = Paced::new(&mut source, Pace::Unhurried);
     let appliance = Appliance::new(site).expect("a free port");
     let (mut told, mut last) = (Vec::<Vec<u16>>::new(), Status::default());
@@ -263,7 +270,8 @@ fn a_knock_is_told_to_the_plc_until_it_is_undone() {
     assert_eq!(codes, [vec![], vec![21], vec![]]);
     assert_eq!(last.vision.health.camera_watch, Watching::Both as u16);
     let (codes, last) = told(GANTRY, |frame, size| moved(frame, size, [-20.0, 5.0]));
-    assert_eq!(codes, [vec![], vec![22], vec![]]);
+    // The mean over the knock itself may be a warning first.
+    assert!(codes.contains(&vec![22]) && codes.last() == Some(&vec![]), "{codes:?}");
     assert!(last.vision.health.camera_error_mm < 0.05);
 }
 
@@ -272,4 +280,114 @@ fn where_only_rails_stand_a_knock_along_them_is_not_said_to_be_watched() {
     let (codes, last) = told("", |frame, size| moved(frame, size, [0.0, 0.4]));
     assert_eq!(codes, [vec![], vec![21], vec![]]);
     assert_eq!(last.vision.health.camera_watch, Watching::Across as u16);
+}
+
+/// A picture blurred by this standard deviation, px.
+fn blurred(frame: &[u8], [width, height]: [usize; 2], sigma_px: f64) -> Vec<u8> {
+    let reach = (3.5 * sigma_px).ceil() as isize;
+    let weight = |k: isize| (-0.5 * (k as f64 / sigma_px).powi(2)).exp();
+    let total: f64 = (-reach..=reach).map(weight).sum();
+    let weights: Vec<f32> = (-reach..=reach).map(|k| (weight(k) / total) as f32).collect();
+    let pass = |from: &[f32], along_x: bool| -> Vec<f32> {
+        (0..width * height)
+            .map(|i| {
+                let (x, y) = ((i % width) as isize, (i / width) as isize);
+                let value = |k: isize| {
+                    let u = if along_x { x + k } else { x }.clamp(0, width as isize - 1);
+                    let v = if along_x { y } else { y + k }.clamp(0, height as isize - 1);
+                    from[v as usize * width + u as usize]
+                };
+                (-reach..=reach).zip(&weights).map(|(k, weight)| weight * value(k)).sum()
+            })
+            .collect()
+    };
+    let frame: Vec<f32> = frame.iter().map(|v| f32::from(*v)).collect();
+    pass(&pass(&frame, true), false).into_iter().map(|v| v.round() as u8).collect()
+}
+
+#[test]
+fn a_lens_out_of_focus_is_told() {
+    for (name, sigma_px, level) in [
+        ("public_c", 2.0, Level::Warning),
+        ("public_d", 2.0, Level::Warning),
+        ("public_c", 3.0, Level::Fault),
+    ] {
+        let Some(recording) = recording(name) else { return };
+        let unsharp = recording.changed(|frame, size| blurred(frame, size, sigma_px));
+        let told = recording.watched(40.0, &unsharp, 40.0);
+        let before = told.iter().find_map(|now| now.sharpness.blur_px).expect("known");
+        let last = told.last().expect("one");
+        eprintln!("{name}, {sigma_px} px: {before:.2}, then {last:?}");
+        assert_eq!((last.sharpness.level, last.place.level), (level, Level::Good), "{name}");
+        let after = last.sharpness.blur_px.expect("known");
+        let expected = before.hypot(sigma_px);
+        assert!((after / expected - 1.0).abs() < 0.2, "{name}: {after}, expected {expected}");
+        // In use from the start it is told as well.
+        let from_start = Recording { frames: unsharp, ..recording };
+        let told = from_start.watched(40.0, &[], 0.0);
+        assert_eq!(told.last().expect("one").sharpness.level, level, "{name}");
+    }
+}
+
+#[test]
+fn a_lamp_that_fails_is_told_with_the_place() {
+    for (name, gain) in [("public_c", 0.5), ("public_d", 1.6)] {
+        let Some(recording) = recording(name) else { return };
+        let darker = recording.changed(|frame, [width, _]| {
+            let lit = |(i, v): (usize, &u8)| {
+                let gain = if i % width < width / 2 { gain } else { 1.0 };
+                (f64::from(*v) * gain).round().min(255.0) as u8
+            };
+            frame.iter().enumerate().map(lit).collect()
+        });
+        let told = recording.watched(40.0, &darker, 40.0);
+        let last = told.last().expect("one");
+        eprintln!("{name}, gain {gain}: {last:?}");
+        assert_eq!((last.light.level, last.place.level), (Level::Warning, Level::Good), "{name}");
+        let columns = u8::try_from(REGIONS[0]).expect("few");
+        assert!((last.light.region - 1) % columns < columns / 2, "{name}: {:?}", last.light);
+    }
+}
+
+#[test]
+fn blur_and_light_are_told_to_the_plc_until_they_are_as_before() {
+    let (codes, _) = told(GANTRY, |frame, size| blurred(frame, size, 1.7));
+    assert_eq!(codes, [vec![], vec![23], vec![]]);
+    let (codes, _) = told(GANTRY, |frame, size| blurred(frame, size, 3.0));
+    assert!(codes.contains(&vec![24]) && codes.last() == Some(&vec![]), "{codes:?}");
+    let (codes, last) = told(GANTRY, |frame, [width, _]| {
+        let lit = |(i, v): (usize, &u8)| if i % width < width / 2 { v / 2 } else { *v };
+        frame.iter().enumerate().map(lit).collect()
+    });
+    assert_eq!(codes, [vec![], vec![25], vec![]]);
+    assert!(last.vision.health.light_change.abs() < 0.1);
+}
+
+#[test]
+fn the_parcels_themselves_show_a_lens_out_of_focus_before_ten_have_passed() {
+    for name in ["public_a", "public_b", "public_c", "public_d"] {
+        let Some(recording) = recording(name) else { return };
+        let unsharp = recording.changed(|frame, size| blurred(frame, size, 2.0));
+        let (_, mut pipeline) = beltgauge::run::build(recording.site.clone()).expect("fits");
+        let [width, height] = recording.site.camera.image_size_px;
+        let (mut passed, mut told_after) = (0, None);
+        let count = recording.frames.len();
+        for (k, frame) in recording.frames.iter().chain(&unsharp).enumerate() {
+            let raw = Plane::packed(frame, width, height).expect("a frame");
+            let time = FrameTime { index: k as u64, t_s: k as f64 / recording.fps };
+            let mut left = 0;
+            pipeline.step(raw, time, &mut |_| left += 1).expect("steps");
+            let now = pipeline.condition().sharpness;
+            if k < count {
+                assert_eq!(now.level, Level::Good, "{name}: {now:?}");
+                continue;
+            }
+            passed += left;
+            if now.level > Level::Good && told_after.is_none() {
+                eprintln!("{name}: {now:?} after {passed} parcels");
+                told_after = Some(passed);
+            }
+        }
+        assert!(told_after.is_some_and(|passed| passed < 10), "{name}: {told_after:?}");
+    }
 }

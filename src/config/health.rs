@@ -19,11 +19,25 @@ pub struct Health {
     pub moved_warning_mm: Option<f64>,
     /// And a fault: as large as the standard deviation up to which dimensions may be used.
     pub moved_fault_mm: f64,
+    /// The picture is unsharp: standard deviation of its blur from which on it is a warning. Heights are then wrong by
+    /// a mm (pixels of 1.5 mm).
+    pub blur_warning_px: f64,
+    /// And a fault: heights are then wrong by 3 mm.
+    pub blur_fault_px: f64,
+    /// The light has changed: share by which a part of the picture may be brighter or darker.
+    pub light_change_max: f64,
 }
 
 impl Default for Health {
     fn default() -> Self {
-        Self { every_s: 10.0, moved_warning_mm: None, moved_fault_mm: 3.0 }
+        Self {
+            every_s: 10.0,
+            moved_warning_mm: None,
+            moved_fault_mm: 3.0,
+            blur_warning_px: 1.5,
+            blur_fault_px: 2.5,
+            light_change_max: 0.3,
+        }
     }
 }
 

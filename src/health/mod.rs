@@ -1,4 +1,4 @@
-//! The instrument watches itself: has the camera moved?
+//! The instrument watches itself: has the camera moved, is the picture sharp, is the light as it was?
 //!
 //! In: raw frames, and how the belt moves. Out: a [`Condition`]. Owns: what stands in the picture (rails,
 //! frame, tunnels), learned while the belt runs, and its mean profiles. Limits: [`Finder`]'s cells.
@@ -9,20 +9,27 @@
 //! [`Finder`]: edges::Finder
 
 mod alarm;
+mod blur;
 mod edges;
 mod geometry;
+mod light;
+mod parcels;
 mod place;
 mod profile;
 mod scene;
 
 pub use alarm::Level;
+pub use light::{Light, REGIONS};
 
 use crate::config::Site;
 use crate::error::Result;
 use crate::image::Plane;
 use crate::plan::{Block, Memory, Plan};
+use crate::units::BeltPx;
 use alarm::Alarm;
 use geometry::{Displacement, Effect};
+use light::Places;
+use parcels::Parcels;
 use profile::SHIFT_MAX_PX;
 use scene::{News, Scene};
 
@@ -30,6 +37,8 @@ use scene::{News, Scene};
 const POINTS_MIN: usize = 24;
 /// Fewer of them that agree, of those that were found: something else has happened.
 const AGREE_MIN: f64 = 0.6;
+/// So large a share of the picture that becomes saturated or black is as bad as light that has changed.
+const SATURATED_MAX: f64 = 0.1;
 /// A direction is watched when its displacement is known to this share of the warning, or of the error.
 const SIGMA_SHARE: f64 = 0.3;
 
@@ -60,35 +69,65 @@ pub struct Place {
     pub level: Level,
 }
 
+/// How sharp the picture is.
+#[derive(Clone, Copy, Debug, Default, PartialEq)]
+pub struct Sharpness {
+    /// Standard deviation of its blur, px of the camera; `None`: not known.
+    pub blur_px: Option<f64>,
+    /// How bad that is.
+    pub level: Level,
+}
+
 /// What the instrument knows of itself.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
 pub struct Condition {
     /// The camera's.
     pub place: Place,
+    /// The lens's.
+    pub sharpness: Sharpness,
+    /// The lamps'.
+    pub light: Light,
 }
 
 impl Condition {
     /// Whether what is measured may be used, as far as the instrument goes.
     pub fn is_fit(&self) -> bool {
-        self.place.level < Level::Fault
+        self.place.level.max(self.sharpness.level) < Level::Fault
     }
 }
 
 /// What watches.
 pub struct Watch {
     scene: Scene,
+    places: Places,
     effect: Effect,
     scratch: Block<f32>,
     /// From where on the camera has moved, mm.
     moved_mm: [f64; 2],
     window_s: f64,
     place: Alarm,
+    /// From where on the picture is unsharp, px.
+    blur_px: [f64; 2],
+    /// The blur that what stands shows, px.
+    scene_blur_px: Option<f64>,
+    sharpness: Alarm,
+    parcels: Parcels,
+    /// The blur that the parcels show, px of the camera, and how bad it is.
+    parcels_blur_px: Option<f64>,
+    parcels_sharpness: Alarm,
+    /// Pixels of the camera in one of the belt view.
+    px_per_view_px: f64,
+    /// From where on the light has changed.
+    light_change: f64,
+    light: Alarm,
     condition: Condition,
 }
 
 /// How the belt has moved since the last frame.
 #[derive(Clone, Copy, Debug, Default)]
-pub struct Ride {
+pub struct Ride<'a> {
+    /// Bits of the belt view that parcels cover; empty: none are.
+    pub covered: &'a [u64],
     /// Travel since start.
     pub travel_mm: f64,
     /// Time since the last frame; `None` while the belt stands.
@@ -99,41 +138,96 @@ impl Watch {
     /// Memory for a site.
     pub fn plan(site: &Site, plan: &mut Plan) {
         Scene::plan(site.camera.image_size_px, plan);
+        Places::plan(plan);
         plan.add::<f32>("health.scratch", edges::POINTS_MAX, "residuals of the camera's motion");
     }
 
     /// Take the planned memory and compute the tables.
     pub fn new(site: &Site, memory: &mut Memory) -> Result<Self> {
         let scene = Scene::new(site, memory)?;
+        let places = Places::new(site, memory)?;
         let scratch = memory.take("health.scratch", 0.0)?;
         let health = &site.config.health;
         Ok(Self {
             scene,
+            places,
             effect: Effect::new(site),
             scratch,
             moved_mm: [health.moved_warning_mm(site.view.mm_per_px), health.moved_fault_mm],
             window_s: health.every_s,
             place: Alarm::default(),
+            blur_px: [health.blur_warning_px, health.blur_fault_px],
+            scene_blur_px: None,
+            sharpness: Alarm::default(),
+            parcels: Parcels::default(),
+            parcels_blur_px: None,
+            parcels_sharpness: Alarm::default(),
+            px_per_view_px: site
+                .camera
+                .mm_per_px(site.config.zone.centre())
+                .map_or(1.0, |mm| site.view.mm_per_px / mm),
+            light_change: health.light_change_max,
+            light: Alarm::default(),
             condition: Condition::default(),
         })
     }
 
     /// Look at a frame.
-    pub fn step(&mut self, site: &Site, raw: Plane<'_>, ride: Ride) {
+    pub fn step(&mut self, site: &Site, raw: Plane<'_>, ride: Ride<'_>) {
         let Some(dt_s) = ride.moving_s else { return };
+        self.places.step(raw, ride.covered, site.view.size_px[0]);
         match self.scene.step(site, raw, ride.travel_mm, dt_s, self.window_s) {
             News::None => {}
-            News::Learned if self.scene.count() < POINTS_MIN => {
-                self.condition.place.watching = Watching::Nothing;
+            News::Learned => {
+                self.places.learn();
+                if self.scene.count() < POINTS_MIN {
+                    self.condition.place.watching = Watching::Nothing;
+                }
+                self.judge_sharpness();
             }
-            News::Learned => {}
-            News::Compared => self.judge_place(),
+            News::Compared => {
+                self.judge_light();
+                self.judge_sharpness();
+                self.judge_place();
+            }
         }
+    }
+
+    /// A parcel passes the middle of the zone: where its top is in the belt view.
+    pub fn parcel(&mut self, view: Plane<'_>, top: &[BeltPx; 4]) {
+        let Some(blur) = self.parcels.add(view, top) else { return };
+        let blur_px = blur * self.px_per_view_px;
+        self.parcels_blur_px = Some(blur_px);
+        // Soft parcels look like that too: it is no fault by itself.
+        self.parcels_sharpness.judge(blur_px, [self.blur_px[0], f64::INFINITY]);
+        self.tell_sharpness();
     }
 
     /// What is known.
     pub fn condition(&self) -> Condition {
         self.condition
+    }
+
+    fn judge_sharpness(&mut self) {
+        self.scene_blur_px = self.scene.blur_px(&mut self.scratch);
+        if let Some(blur_px) = self.scene_blur_px {
+            self.sharpness.judge(blur_px, self.blur_px);
+        }
+        self.tell_sharpness();
+    }
+
+    fn tell_sharpness(&mut self) {
+        self.condition.sharpness = Sharpness {
+            blur_px: self.scene_blur_px.or(self.parcels_blur_px),
+            level: self.sharpness.level().max(self.parcels_sharpness.level()),
+        };
+    }
+
+    fn judge_light(&mut self) {
+        let light = self.places.changed();
+        let share = light.saturated.max(light.black) / SATURATED_MAX * self.light_change;
+        self.light.judge(light.change.abs().max(share), [self.light_change, f64::INFINITY]);
+        self.condition.light = Light { level: self.light.level(), ..light };
     }
 
     fn judge_place(&mut self) {

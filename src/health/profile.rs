@@ -1,5 +1,6 @@
 //! Mean profiles across edges, and by how much two of them are shifted against each other.
 
+use super::blur::{self, Edge};
 use super::edges::{Axis, Point};
 use crate::image::Plane;
 use nalgebra::{Matrix3, Vector3};
@@ -28,6 +29,14 @@ pub(super) struct Profile<'a> {
     pub(super) mean: &'a [f32],
     /// First sample and end inside the picture.
     pub(super) inside: [usize; 2],
+}
+
+impl Profile<'_> {
+    /// The step that is shifted so far from its middle.
+    pub(super) fn edge(&self, shift_px: f32) -> Option<Edge> {
+        let inside = &self.mean[self.inside[0]..self.inside[1]];
+        blur::edge(inside, REACH_PX as f32 + shift_px - self.inside[0] as f32)
+    }
 }
 
 /// Which samples of a point's profile lie in a picture.

@@ -11,14 +11,18 @@ use crate::error::Result;
 use crate::image::Plane;
 use crate::plan::{Block, Memory, Plan};
 
-/// A frame adds one of so many parts of the points, and compares one of so many.
+/// A frame adds one of so many parts of the points.
 const PARTS: usize = 8;
+/// And compares so many of them.
+const COMPARED: usize = 10;
 /// A mean is of so many frames, at least: noise and what passes by.
 const FRAMES_MIN: u32 = 8;
 /// Shifts that a profile may have, both ways.
 const SHIFTS: usize = 2 * SHIFT_MAX_PX as usize - 1;
 /// Below this share of the points that are found again, the picture has moved further than was looked for.
 const FOUND_MIN: f64 = 0.5;
+/// Fewer sharp steps tell none either.
+const SHARP_MIN: usize = 12;
 /// Steps of the search for a far shift, px.
 const STRIDE_PX: i32 = 2;
 
@@ -43,6 +47,10 @@ pub(super) struct Scene {
     means: Block<f32>,
     reference: Block<f32>,
     has_reference: bool,
+    /// Which points showed a clean step when they were learned.
+    is_step: Block<bool>,
+    /// Standard deviation of the blur of each, px; NaN: not known.
+    widths: Block<f32>,
     /// How alike each point is at every shift, -1 to 1 in 127 steps.
     alike: Block<i8>,
     matches: Block<Option<Match>>,
@@ -81,6 +89,8 @@ impl Scene {
         plan.add::<u32>("health.sums", samples, "a profile of each in this window");
         plan.add::<f32>("health.means", samples, "the same of the last window");
         plan.add::<f32>("health.reference", samples, "the same when it was learned");
+        plan.add::<bool>("health.is_step", POINTS_MAX, "a clean step when it was learned");
+        plan.add::<f32>("health.widths", POINTS_MAX, "how blurred each is");
         plan.add::<i8>("health.alike", POINTS_MAX * SHIFTS, "each at every shift");
         plan.add::<Option<Match>>("health.matches", POINTS_MAX, "how each has moved");
     }
@@ -94,6 +104,8 @@ impl Scene {
             means: memory.take("health.means", 0.0)?,
             reference: memory.take("health.reference", 0.0)?,
             has_reference: false,
+            is_step: memory.take("health.is_step", false)?,
+            widths: memory.take("health.widths", f32::NAN)?,
             alike: memory.take("health.alike", 0)?,
             matches: memory.take("health.matches", None)?,
             phase: Phase::Find,
@@ -154,30 +166,35 @@ impl Scene {
             sums.fill(0);
         }
         (self.frames, self.window_s) = ([0; PARTS], 0.0);
-        if self.has_reference {
-            self.phase = Phase::Compare { next: 0, is_last: false };
-            return News::None;
+        if !self.has_reference {
+            self.reference.copy_from_slice(&self.means);
         }
-        self.reference.copy_from_slice(&self.means);
-        self.has_reference = true;
-        News::Learned
+        self.phase = Phase::Compare { next: 0, is_last: false };
+        News::None
     }
 
     /// So many points from `next` on are compared in a frame.
     fn part_from(&self, next: usize) -> std::ops::Range<usize> {
-        next..(next + POINTS_MAX / PARTS).min(self.count)
+        next..(next + COMPARED).min(self.count)
     }
 
     fn compare(&mut self, next: usize, is_last: bool) -> News {
         let part = self.part_from(next);
         for i in part.clone() {
-            let point = &self.points[i];
+            let point = self.points[i];
             let expected_px = if is_last {
                 point.shift_px(self.searched_px)
             } else {
                 point.moved_px(&self.expected) as f32
             };
-            self.matches[i] = profile::find(self.reference_of(i), &self.now(i), expected_px);
+            let now = self.now(i);
+            let found = profile::find(self.reference_of(i), &now, expected_px);
+            let edge = found.and_then(|found| now.edge(found.shift_px));
+            self.matches[i] = found;
+            self.widths[i] = edge.map_or(f32::NAN, |edge| edge.sigma_px / point.slope.hypot(1.0));
+            if !self.has_reference {
+                self.is_step[i] = edge.is_some_and(|edge| edge.is_clean());
+            }
         }
         if part.end < self.count {
             self.phase = Phase::Compare { next: part.end, is_last };
@@ -189,6 +206,10 @@ impl Scene {
             return News::None;
         }
         self.phase = Phase::Gather;
+        if !self.has_reference {
+            self.has_reference = true;
+            return News::Learned;
+        }
         News::Compared
     }
 
@@ -244,6 +265,22 @@ impl Scene {
     pub(super) fn compared(&self) -> impl Iterator<Item = (&Point, Option<&Match>)> + Clone {
         let matches = self.matches[..self.count].iter().map(Option::as_ref);
         self.points[..self.count].iter().zip(matches)
+    }
+
+    /// Standard deviation of the blur of the sharpest quarter of the steps, px; `None`: there are too few.
+    /// `scratch` has room for all.
+    pub(super) fn blur_px(&self, scratch: &mut [f32]) -> Option<f64> {
+        let all = self.widths[..self.count].iter().zip(&self.is_step[..self.count]);
+        let known = all.filter(|(width, is_step)| **is_step && width.is_finite());
+        let count = known.zip(&mut *scratch).fold(0, |n, ((width, _), into)| {
+            *into = *width;
+            n + 1
+        });
+        (count >= SHARP_MIN).then(|| {
+            let (_, quartile, _) =
+                scratch[..count].select_nth_unstable_by(count / 4, f32::total_cmp);
+            f64::from(*quartile)
+        })
     }
 
     /// How the camera was found to have moved: what stands is looked for there again.

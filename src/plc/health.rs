@@ -24,4 +24,14 @@ pub struct HealthStatus {
     pub camera_error_mm: f64,
     /// How bad that is.
     pub camera: Concern,
+    /// Standard deviation of the picture's blur; `None`: not known.
+    pub blur_px: Option<f64>,
+    /// How bad that is.
+    pub blur: Concern,
+    /// The region of the picture whose light has changed most, from 1; 0: not known yet.
+    pub light_region: u16,
+    /// Its brightness over that when it was learned, less 1.
+    pub light_change: f64,
+    /// How bad that is.
+    pub light: Concern,
 }

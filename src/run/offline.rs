@@ -129,13 +129,22 @@ fn gap_doubt(frames: u64) -> Option<String> {
 
 /// What of the instrument is not as it was at the start of a recording.
 fn condition_doubt(condition: &Condition) -> Option<String> {
-    let moved = condition.place.moved;
-    (condition.place.level > Level::Good).then(|| {
+    let Condition { place, sharpness, light } = condition;
+    let moved = (place.level > Level::Good).then(|| {
         format!(
             "the camera has moved by {:.2} px: places or dimensions are wrong by up to {:.1} mm since then",
-            moved.picture_px, moved.error_mm
+            place.moved.picture_px, place.moved.error_mm
         )
-    })
+    });
+    let unsharp = sharpness.blur_px.filter(|_| sharpness.level > Level::Good).map(|px| {
+        format!("the picture is blurred by {px:.1} px: heights are wrong; focus or clean the lens")
+    });
+    let other_light = (light.level > Level::Good).then(|| {
+        let (percent, region) = (100.0 * light.change, light.region);
+        format!("the light has changed by {percent:.0} % in part {region} of the picture (4 x 3, from the top left)")
+    });
+    let all: Vec<String> = [moved, unsharp, other_light].into_iter().flatten().collect();
+    (!all.is_empty()).then(|| all.join("; "))
 }
 
 /// What of the belt is not as the configuration says, at the end of a recording.

@@ -28,6 +28,8 @@ fn figures(s: &State) -> Vec<(&'static str, &'static str, &'static str, f64)> {
         ("camera_watch", "gauge", "whether a camera that moves is seen: 0 being learned, 1 no, 2 across travel, 3 along travel, 4 yes", f64::from(camera.watch)),
         ("camera_moved_pixels", "gauge", "how far the picture has moved since start", camera.moved_px),
         ("camera_error_millimetres", "gauge", "the largest error that this causes", camera.moved_error_mm),
+        ("blur_pixels", "gauge", "standard deviation of the picture's blur", camera.blur_px.unwrap_or(nothing)),
+        ("light_change_ratio", "gauge", "the largest change of a part's brightness since start", camera.light_change),
         ("belt_speed_millimetres_per_second", "gauge", "belt speed", belt.speed_mm_per_s),
         ("belt_measured", "gauge", "1: the belt's motion is measured, not assumed", flag(belt.measured)),
         ("belt_by_encoder", "gauge", "1: by the encoder", flag(belt.by_encoder)),

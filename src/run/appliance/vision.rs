@@ -162,12 +162,17 @@ fn belt_status(health: &Health) -> BeltStatus {
 }
 
 fn health_status(condition: &Condition) -> HealthStatus {
-    let place = &condition.place;
+    let Condition { place, sharpness, light } = condition;
     HealthStatus {
         camera_watch: place.watching as u16,
         camera_moved_px: place.moved.picture_px,
         camera_error_mm: place.moved.error_mm,
         camera: concern(place.level),
+        blur_px: sharpness.blur_px,
+        blur: concern(sharpness.level),
+        light_region: u16::from(light.region),
+        light_change: light.change,
+        light: concern(light.level),
     }
 }
 

@@ -176,6 +176,9 @@ impl web::Machine for Insight {
                 watch: vision.health.camera_watch,
                 moved_px: vision.health.camera_moved_px,
                 moved_error_mm: vision.health.camera_error_mm,
+                blur_px: vision.health.blur_px,
+                light_region: vision.health.light_region,
+                light_change: vision.health.light_change,
             },
             belt: web::BeltState {
                 speed_mm_per_s: vision.belt_speed_mm_per_s,

@@ -170,6 +170,35 @@ mod tests {
     }
 
     #[test]
+    fn a_lens_that_zooms_makes_sides_longer_and_the_height_wrong_where_the_travel_is_known_otherwise()
+     {
+        let view = BeltView {
+            size_px: [1000, 700],
+            mm_per_px: 1.5,
+            origin: BeltMm { x: -800.0, y: 600.0 },
+            nadir: Vector2::new(0.0, 0.0),
+            camera_height_mm: 1500.0,
+        };
+        let geometry =
+            Geometry { view: &view, zone: &ZONE, height_max_mm: 400.0, travel_per_frame_mm: 20.0 };
+        let zoom = 0.0004;
+        let zoomed = |at: Vector2<f64>| zoom * at;
+        let bias = |travel_scale: f64| {
+            bias_mm(&geometry, [235.0, 125.0, 70.0], 20.0, &zoomed, travel_scale).expect("seen")
+        };
+        // The belt's texture zooms too.
+        let [length, width, height] = bias(1.0 + zoom);
+        let near = |value: f64, expected: f64| (value - expected).abs() < 0.03;
+        assert!(near(length, zoom * 235.0) && near(width, zoom * 125.0), "{length} {width}");
+        assert!(near(height, 0.0), "{height}");
+        // What is faster by 1 part in 2500 looks higher by as much of the camera's distance.
+        let [.., height] = bias(1.0);
+        assert!((height - zoom * 1430.0).abs() < 0.2, "{height}");
+        let none = bias_mm(&geometry, [235.0, 125.0, 70.0], 20.0, &|_| Vector2::zeros(), 1.0);
+        assert_eq!(none, Some([0.0; 3]));
+    }
+
+    #[test]
     fn what_is_seen_in_one_frame_only_is_not_measured() {
         let view = BeltView {
             size_px: [1000, 700],
