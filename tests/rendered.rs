@@ -2,9 +2,8 @@
 
 mod common;
 
-use common::truth::{Json, camera_centre, load, number, vector, write_site};
+use common::truth::{Json, camera_centre, load, number, write_site};
 use common::{beltgauge, scratch, shared_data};
-use serde_json::Value;
 use std::path::{Path, PathBuf};
 use std::process::{Command, Stdio};
 

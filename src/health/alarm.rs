@@ -47,7 +47,7 @@ impl Alarm {
         self.wanted = Some(wanted);
     }
 
-    pub(super) fn level(&self) -> Level {
+    pub(super) fn level(self) -> Level {
         self.level
     }
 }

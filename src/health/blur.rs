@@ -25,7 +25,7 @@ pub(super) struct Edge {
 
 impl Edge {
     /// Whether it is a step and nothing else.
-    pub(super) fn is_clean(&self) -> bool {
+    pub(super) fn is_clean(self) -> bool {
         self.misfit < MISFIT_MAX
     }
 }

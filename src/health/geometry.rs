@@ -19,8 +19,8 @@ pub type Rates = SMatrix<f64, 2, PARAMETERS>;
 /// What each parameter does to length, width and height.
 type Biases = SMatrix<f64, 3, PARAMETERS>;
 
-/// How large each parameter may well be: a knock turns a camera, and hardly shifts it.
-pub const PRIOR_SIGMA: [f64; PARAMETERS] = [0.2, 0.2, 0.2, 0.005, 0.005, 0.2];
+/// How large each parameter may be: a knock turns a camera, and hardly shifts it.
+pub const PRIOR_SIGMA: [f64; PARAMETERS] = [0.2, 0.2, 0.2, 0.001, 0.001, 0.2];
 /// Step of the numerical derivatives.
 const STEP: f64 = 1e-4;
 /// Sides of the parcels that the error in mm is told for: a common one, a large one, a flat one.
@@ -85,23 +85,20 @@ impl Effect {
     /// Compute the tables; allocates.
     pub fn new(site: &Site) -> Self {
         let (camera, zone) = (&site.camera, &site.config.zone);
-        let mut points = heapless::Vec::new();
-        for at in grid(zone) {
-            let raw = camera.project(Vector3::new(at.x, at.y, 0.0));
-            let rates = raw.and_then(|raw| {
-                let px = rates_px(camera, raw)?;
-                let columns = (0..PARAMETERS).map(|k| moved_mm(camera, at, &unit(k, STEP)));
-                let mm = columns.collect::<Option<Vec<_>>>()?;
-                Some([px, Rates::from_columns(&mm) / STEP])
-            });
-            // There are no more points than places.
-            let _ = rates.map(|rates| points.push(rates));
-        }
-        let mut effect = Self { zone: points, parcels: heapless::Vec::new() };
-        for size_mm in PARCELS_MM.into_iter().filter(|size| size[2] <= site.height_max_mm) {
-            // There are no more sizes than places.
-            let _ = effect.biases(site, size_mm).map(|biases| effect.parcels.push(biases));
-        }
+        let rates = |at: BeltMm| {
+            let raw = camera.project(Vector3::new(at.x, at.y, 0.0))?;
+            let px = rates_px(camera, raw)?;
+            let mut mm = Rates::zeros();
+            for k in 0..PARAMETERS {
+                mm.set_column(k, &(moved_mm(camera, at, &unit(k, STEP))? / STEP));
+            }
+            Some([px, mm])
+        };
+        // There are as many places as points, and as sizes.
+        let mut effect =
+            Self { zone: grid(zone).filter_map(rates).collect(), parcels: heapless::Vec::new() };
+        let sizes = PARCELS_MM.into_iter().filter(|size| size[2] <= site.height_max_mm);
+        effect.parcels = sizes.filter_map(|size_mm| effect.biases(site, size_mm)).collect();
         effect
     }
 

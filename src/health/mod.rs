@@ -40,7 +40,7 @@ const AGREE_MIN: f64 = 0.6;
 /// So large a share of the picture that becomes saturated or black is as bad as light that has changed.
 const SATURATED_MAX: f64 = 0.1;
 /// A direction is watched when its displacement is known to this share of the warning, or of the error.
-const SIGMA_SHARE: f64 = 0.3;
+const SIGMA_SHARE: f64 = 0.5;
 
 /// How well the camera's place is watched.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
@@ -235,7 +235,7 @@ impl Watch {
         if count < POINTS_MIN {
             return;
         }
-        let fitted = place::fit(scene.compared(), &mut self.scratch);
+        let fitted = place::fit(&scene.compared(), &mut self.scratch);
         let place = &mut self.condition.place;
         // What stood is nowhere within reach.
         if fitted.found < count / 4 {
@@ -245,7 +245,10 @@ impl Watch {
             place.level = self.place.level();
             return;
         }
-        if (fitted.agree as f64) < AGREE_MIN * fitted.found as f64 {
+        // Where hardly anything is where it was, it has moved, however well that is understood.
+        let enough = AGREE_MIN * fitted.found as f64;
+        let moved_on = (fitted.still as f64) < fitted.found as f64 - enough;
+        if (fitted.agree as f64) < enough && !moved_on {
             place.watching = Watching::Nothing;
             return;
         }

@@ -34,7 +34,7 @@ impl Parcels {
     pub(super) fn add(&mut self, view: Plane<'_>, top: &[BeltPx; 4]) -> Option<f64> {
         let mut widths = heapless::Vec::<f32, { 4 * PER_SIDE }>::new();
         for (a, b) in top.iter().zip(top.iter().cycle().skip(1)) {
-            for edge in side(view, *a, *b).filter(blur::Edge::is_clean) {
+            for edge in side(view, *a, *b).filter(|edge| edge.is_clean()) {
                 // There are no more than places.
                 let _ = widths.push(edge.sigma_px);
             }

@@ -3,6 +3,7 @@
 //! In: raw frames while the belt runs. Out: for each edge point how it has moved since the reference, the
 //! first window. Spread over the frames: each adds a part of the points, each compares a part.
 
+use super::blur::Edge;
 use super::edges::{Finder, POINTS_MAX, Point};
 use super::geometry::Motion;
 use super::profile::{self, Match, Profile, SAMPLES, SHIFT_MAX_PX};
@@ -12,11 +13,11 @@ use crate::image::Plane;
 use crate::plan::{Block, Memory, Plan};
 
 /// A frame adds one of so many parts of the points.
-const PARTS: usize = 8;
+const PARTS: usize = 16;
 /// And compares so many of them.
 const COMPARED: usize = 10;
 /// A mean is of so many frames, at least: noise and what passes by.
-const FRAMES_MIN: u32 = 8;
+const FRAMES_MIN: u32 = 6;
 /// Shifts that a profile may have, both ways.
 const SHIFTS: usize = 2 * SHIFT_MAX_PX as usize - 1;
 /// Below this share of the points that are found again, the picture has moved further than was looked for.
@@ -193,7 +194,7 @@ impl Scene {
             self.matches[i] = found;
             self.widths[i] = edge.map_or(f32::NAN, |edge| edge.sigma_px / point.slope.hypot(1.0));
             if !self.has_reference {
-                self.is_step[i] = edge.is_some_and(|edge| edge.is_clean());
+                self.is_step[i] = edge.is_some_and(Edge::is_clean);
             }
         }
         if part.end < self.count {

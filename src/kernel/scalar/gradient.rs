@@ -9,25 +9,35 @@ const SCALE: i16 = 8;
 /// Gradients along x and y of the middle one of three rows, each as long as `least`'s, Sobel's sums
 /// over 8; the outermost pixels have none. `first`: nothing was kept before.
 pub fn keep_least(rows: [&[u8]; 3], least: [&mut [i8]; 2], first: bool) {
+    if first {
+        gradients(rows, least, |now, _| now);
+    } else {
+        gradients(rows, least, nearest_to_zero);
+    }
+}
+
+fn gradients(rows: [&[u8]; 3], least: [&mut [i8]; 2], keep: impl Fn(i8, i8) -> i8) {
     let [along, across] = least;
     let width = along.len();
     if width < 3 {
         return;
     }
-    let [above, here, below] = rows.map(|row| &row[..width]);
-    let inner = along[1..width - 1].iter_mut().zip(&mut across[1..width - 1]);
-    let columns = above.windows(3).zip(here.windows(3)).zip(below.windows(3));
-    for ((x, y), ((a, b), c)) in inner.zip(columns) {
-        let at = |v: u8| i16::from(v);
-        let gx = at(a[2]) + 2 * at(b[2]) + at(c[2]) - at(a[0]) - 2 * at(b[0]) - at(c[0]);
-        let gy = at(c[0]) + 2 * at(c[1]) + at(c[2]) - at(a[0]) - 2 * at(a[1]) - at(a[2]);
-        let (gx, gy) = ((gx / SCALE) as i8, (gy / SCALE) as i8);
-        *x = if first { gx } else { nearest_to_zero(gx, *x) };
-        *y = if first { gy } else { nearest_to_zero(gy, *y) };
+    let n = width - 2;
+    let [[a0, a1, a2], [b0, _, b2], [c0, c1, c2]] =
+        rows.map(|row| [&row[..n], &row[1..=n], &row[2..n + 2]]);
+    let (xs, ys) = (&mut along[1..=n], &mut across[1..=n]);
+    // All are as long: by index, so that nothing is in the way of vectors.
+    for i in 0..n {
+        let at = |row: &[u8]| i16::from(row[i]);
+        let gx = at(a2) + 2 * at(b2) + at(c2) - at(a0) - 2 * at(b0) - at(c0);
+        let gy = at(c0) + 2 * at(c1) + at(c2) - at(a0) - 2 * at(a1) - at(a2);
+        xs[i] = keep((gx / SCALE) as i8, xs[i]);
+        ys[i] = keep((gy / SCALE) as i8, ys[i]);
     }
 }
 
 /// Of two values of one sign the smaller; of two signs: 0.
+#[inline]
 fn nearest_to_zero(a: i8, b: i8) -> i8 {
     a.min(b).max(0) + a.max(b).min(0)
 }
