@@ -12,7 +12,7 @@
 //! - [`config`]: TOML to a checked [`config::Site`].
 //! - [`plan`]: all memory of the vision path, named and reasoned, in one mapping.
 //! - [`kernel`]: pixel loops on slices, a readable one and one in vectors. [`stage`]: the steps that own state.
-//! - [`belt`]: where the belt is. [`pipeline`]: the steps in order. [`event`]: what comes out.
+//! - [`belt`]: where the belt is. [`health`]: whether the instrument is as it was. [`pipeline`]: the steps in order. [`event`]: what comes out.
 //! - [`sandbox`]: child processes for what strangers bring.
 //! - [`source`]: where frames come from, and what records them. [`plc`]: how records reach the PLC.
 //! - [`store`]: the appliance's disk: configurations in force, sticks, whom it trusts.
@@ -31,6 +31,7 @@ pub mod camera;
 pub mod config;
 pub mod error;
 pub mod event;
+pub mod health;
 pub mod image;
 pub mod kernel;
 pub mod pipeline;

@@ -17,6 +17,7 @@ use crate::belt::BeltPosition;
 use crate::config::Site;
 use crate::error::{Error, Result};
 use crate::event::{Counters, Flags, NotMeasured, ParcelRecord};
+use crate::health::{Condition, Ride, Watch};
 use crate::image::{FrameTime, Plane};
 use crate::kernel::Level;
 use crate::kernel::scalar::bits::{self, Square, words};
@@ -42,6 +43,9 @@ const HOLD_MARGIN_PX: usize = 2;
 /// Around a parcel this many px are no witness of the belt's motion: blur and compression
 /// carry the parcel's own, faster motion into them.
 const COVER_MARGIN_PX: usize = 8;
+
+/// Parcels that pass the middle of the zone in one frame, and are looked at.
+const PASSING_MAX: usize = 4;
 
 /// What is narrower than this many px cannot be told from a sliver of shadow.
 const SIDE_MIN_PX: f64 = 4.0;
@@ -70,6 +74,7 @@ pub struct Pipeline {
     riders: Riders,
     tracker: Tracker,
     measure: Measure,
+    watch: Watch,
     /// Bit mask: parcels and their surroundings in the last frame.
     covered: Block<u64>,
     /// Bit mask: pixels that the background must not learn.
@@ -95,6 +100,7 @@ impl Pipeline {
         Riders::plan(size, limits.blobs_max, plan);
         Tracker::plan(limits.tracks_max, limits.blobs_max, plan);
         Measure::plan(limits.tracks_max, limits.views_per_track_max, plan);
+        Watch::plan(site, plan);
         let mask = words(size[0]) * size[1];
         plan.add::<u64>("pipeline.covered", mask, "bit: parcel or near one in the last frame");
         plan.add::<u64>("pipeline.hold", mask, "bit: not to be learned as background");
@@ -138,6 +144,7 @@ impl Pipeline {
             config.limits.views_per_track_max,
             memory,
         )?;
+        let watch = Watch::new(&site, memory)?;
         Ok(Self {
             rectify,
             background,
@@ -146,6 +153,7 @@ impl Pipeline {
             riders,
             tracker,
             measure,
+            watch,
             covered: memory.take("pipeline.covered", 0)?,
             hold: memory.take("pipeline.hold", 0)?,
             scratch: memory.take("pipeline.scratch", 0)?,
@@ -208,6 +216,7 @@ impl Pipeline {
         self.track(motion.step_mm);
         self.measure_tracks(time, motion.step_mm);
         self.report(emit);
+        self.watch(raw, motion.step_mm, dt_s);
         self.counters.segment_overflows = self.segment.overflows;
         self.counters.track_overflows = self.tracker.overflows;
         Ok(())
@@ -297,6 +306,20 @@ impl Pipeline {
         for (covered, seen) in self.covered.iter_mut().zip(self.rectify.seen()) {
             *covered |= !seen;
         }
+    }
+
+    /// Whether the instrument is as it was.
+    fn watch(&mut self, raw: Plane<'_>, step_mm: f64, dt_s: f64) {
+        let tops: heapless::Vec<_, PASSING_MAX> = self
+            .passing_middle()
+            .filter_map(|sight| sight.top(&self.site.view))
+            .take(PASSING_MAX)
+            .collect();
+        tops.iter().for_each(|top| self.watch.parcel(self.rectify.view(), top));
+        let moves = !self.stands_still && step_mm != 0.0;
+        let moving_s = moves.then_some(dt_s);
+        let ride = Ride { covered: &self.covered, travel_mm: self.at.travel_mm, moving_s };
+        self.watch.step(&self.site, raw, ride);
     }
 
     /// Give blobs to tracks. A piece beside a measured cuboid (a side face as grey as the belt
@@ -490,6 +513,11 @@ impl Pipeline {
     pub fn health(&self) -> Health {
         let contrast_min_grey = self.background.contrast_min_grey();
         self.witnesses.health(&self.odometry, self.riders.ride(), contrast_min_grey)
+    }
+
+    /// What the instrument knows of itself.
+    pub fn condition(&self) -> Condition {
+        self.watch.condition()
     }
 
     /// Frames that the belt's steps show to be missing, though their times do not tell.

@@ -15,11 +15,12 @@ const MAY_USE: &[(&str, &[&str])] = &[
     ("config", &["camera", "units", "error"]),
     ("kernel", &["image"]),
     ("stage", &["kernel", "camera", "config", "belt", "plan", "image", "units", "error"]),
+    ("health", &["stage", "kernel", "camera", "config", "plan", "image", "units", "error"]),
     (
         "pipeline",
         &[
-            "stage", "kernel", "camera", "config", "belt", "plan", "image", "event", "units",
-            "error",
+            "health", "stage", "kernel", "camera", "config", "belt", "plan", "image", "event",
+            "units", "error",
         ],
     ),
     ("sandbox", &["error"]),

@@ -1,12 +1,14 @@
 //! TOML -> validated [`Config`]. Every key but those of the smallest configuration has a default;
 //! unknown keys are refused; a wrong value names file, key, value, allowed range and remedy.
 
+mod health;
 mod json_schema;
 mod plc;
 mod ranges;
 mod schema;
 mod service;
 
+pub use health::Health;
 pub use json_schema::json_schema;
 pub use plc::{Can, DimensionOrder, Encoder, Modbus, Plc, WordOrder};
 pub use schema::{

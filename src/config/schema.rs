@@ -1,5 +1,6 @@
 //! The keys of the configuration file, their defaults and ranges.
 
+use super::health::Health;
 use super::plc::{Can, Encoder, Modbus, Plc};
 use super::ranges::{self, range};
 use super::service::{Archive, Web};
@@ -35,6 +36,9 @@ pub struct Config {
     /// `[measure]`
     #[serde(default)]
     pub measure: Measure,
+    /// `[health]`
+    #[serde(default)]
+    pub health: Health,
     /// `[limits]`
     #[serde(default)]
     pub limits: Limits,

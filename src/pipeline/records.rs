@@ -79,7 +79,7 @@ impl Pipeline {
         record.flags.set(doubts(&self.site, measured, travel_sigma), true);
         record.flags.set(Flags::MERGED, track.was_merged());
         // A standard deviation above the limit is a flag too.
-        record.may_be_used = record.flags.is_empty();
+        record.may_be_used = record.flags.is_empty() && self.condition().is_fit();
         record
     }
 }

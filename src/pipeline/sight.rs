@@ -1,6 +1,7 @@
 //! What is in view in the last frame, for pictures that people look at.
 
 use super::Pipeline;
+use crate::camera::BeltView;
 use crate::stage::track::Phase;
 use crate::units::{BeltMm, BeltPx};
 
@@ -18,6 +19,14 @@ pub struct Sight {
     /// Where the view shows the corners of its cuboid as it is estimated so far, on the belt plane:
     /// four of the base, then the four above them.
     pub cuboid: Option<[BeltMm; 8]>,
+}
+
+impl Sight {
+    /// Where its top is in the belt view.
+    pub(super) fn top(&self, view: &BeltView) -> Option<[BeltPx; 4]> {
+        let cuboid = self.cuboid?;
+        Some(std::array::from_fn(|k| view.px(cuboid[4 + k])))
+    }
 }
 
 impl Pipeline {

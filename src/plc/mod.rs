@@ -8,6 +8,7 @@ pub mod dbc;
 pub mod document;
 pub mod frames;
 mod guard;
+pub mod health;
 pub mod interface;
 pub mod journal;
 pub mod link;

@@ -4,6 +4,7 @@
 //! sequence number first and last, so that a client that reads it in two requests can tell whether
 //! it changed in between.
 
+use super::health::{Concern, HealthStatus};
 use super::journal::Keeping;
 use super::table::{Field, fields};
 use crate::config::WordOrder;
@@ -83,6 +84,8 @@ pub struct VisionStatus {
     pub counters: Counters,
     /// What is known of the belt beside its speed.
     pub belt: BeltStatus,
+    /// What the instrument knows of itself.
+    pub health: HealthStatus,
 }
 
 /// Ratios that command 6 corrects.
@@ -178,7 +181,7 @@ pub struct Status {
 }
 
 /// What is wrong or worth knowing: code and meaning.
-pub const REASONS: [(u16, &str); 21] = [
+pub const REASONS: [(u16, &str); 26] = [
     (0, "all is well"),
     (1, "the frame source has ended or failed"),
     (2, "no frames arrive"),
@@ -212,6 +215,11 @@ pub const REASONS: [(u16, &str); 21] = [
         20,
         "the archive: its disk fails or does not answer, entries were lost, or damage was found, since start; see the page",
     ),
+    (21, "the camera has moved a little: see camera_moved, camera_error; fasten it"),
+    (22, "the camera has moved so far that sizes and places are wrong: calibrate the belt again"),
+    (23, "the picture is less sharp than it should be: see blur; clean and focus the lens"),
+    (24, "the picture is so unsharp that heights are wrong: see blur; focus the lens"),
+    (25, "the light has changed, or the lens is dirty: see light_region, light_change"),
 ];
 
 impl Status {
@@ -259,6 +267,9 @@ impl Status {
             self.vision.belt.hides_parcels,
             self.vision.frames_missing,
             self.vision.archive_fails,
+            self.vision.health.camera != Concern::None,
+            self.vision.health.blur != Concern::None,
+            self.vision.health.light != Concern::None,
         ])
     }
 
@@ -280,11 +291,16 @@ impl Status {
             (6, self.encoder_silent),
             (15, self.vision.belt.encoder_disagrees),
             (16, self.vision.belt.not_as_configured),
+            (22, self.vision.health.camera == Concern::Fault),
+            (24, self.vision.health.blur == Concern::Fault),
             (7, self.plc_silent),
             (8, !self.vision.ready),
             (18, self.vision.belt.hides_parcels),
             (17, self.vision.belt.ambiguous),
             (19, self.vision.frames_missing),
+            (21, self.vision.health.camera == Concern::Warning),
+            (23, self.vision.health.blur == Concern::Warning),
+            (25, self.vision.health.light != Concern::None),
             (9, self.stopped),
             (13, self.vision.import.result == IMPORT_REFUSED),
             (20, self.vision.archive_fails),
@@ -334,7 +350,7 @@ pub const STATUS_FIELDS: &[StatusField] = fields![
     [4, V1_0, "test_i16", I16, "", 1.0, "constant -12345: checks the sign", |_| -12345.0],
     [10, V1_0, "heartbeat", U16, "", 1.0, "rises ten times a second while frames arrive; wraps", |s| f64::from(s.heartbeat)],
     [11, V1_0, "status", U16, "bits", 1.0, "bit 0 running, bit 1 ready (belt learned), bit 2 belt motion measured, bit 3 by the encoder, bit 4 stopped by command, bit 5 PLC silent, bit 6 parcels wait to be acknowledged", |s| f64::from(s.status_bits())],
-    [12, V1_0, "fault", U16, "bits", 1.0, "bit 0 frame source ended, bit 1 a table has been full since start (see counters), bit 2 a parcel was never acknowledged, bit 3 CAN bus off or down, bit 4 encoder silent, bit 5 no camera, bit 6 the disk fails, bit 7 encoder and belt disagree, bit 8 the belt does not run as configured, bit 9 the belt hides parcels, bit 10 frames are missing, bit 11 the archive fails", |s| f64::from(s.fault_bits())],
+    [12, V1_0, "fault", U16, "bits", 1.0, "bit 0 frame source ended, bit 1 a table has been full since start (see counters), bit 2 a parcel was never acknowledged, bit 3 CAN bus off or down, bit 4 encoder silent, bit 5 no camera, bit 6 the disk fails, bit 7 encoder and belt disagree, bit 8 the belt does not run as configured, bit 9 the belt hides parcels, bit 10 frames are missing, bit 11 the archive fails, bit 12 the camera has moved, bit 13 the picture is unsharp, bit 14 the light has changed", |s| f64::from(s.fault_bits())],
     [13, V1_0, "belt_speed", U32, "mm/s", 10.0, "belt speed", |s| s.vision.belt_speed_mm_per_s],
     [15, V1_0, "frames", U32, "", 1.0, "frames processed; wraps", |s| wrapped(s.vision.counters.frames)],
     [17, V1_0, "frames_dropped", U32, "", 1.0, "frames that came too late; wraps", |s| wrapped(s.vision.frames_dropped)],
@@ -368,6 +384,12 @@ pub const STATUS_FIELDS: &[StatusField] = fields![
     [72, V2_0, "encoder_ratio", I16, "", 10000.0, "the encoder's travel over the belt's, negative when it counts the other way; 0: not known, or it stands", |s| s.vision.belt.encoder_ratio.unwrap_or(0.0)],
     [73, V2_0, "mm_per_count", I32, "mm", 1_000_000.0, "belt travel of a count, as configured or set by command 6; 0: no encoder", |s| s.mm_per_count.unwrap_or(0.0)],
     [75, V2_0, "mm_per_count_seen", I32, "mm", 1_000_000.0, "the same as the belt's texture shows it; 0: not known", |s| s.mm_per_count_seen().unwrap_or(0.0)],
+    [77, V2_0, "camera_watch", U16, "", 1.0, "whether a camera that moves is seen: 0 what stands is being learned, 1 no: too little stands, 2 across travel alone, 3 along travel alone, 4 yes", |s| f64::from(s.vision.health.camera_watch)],
+    [78, V2_0, "camera_moved", U16, "px", 100.0, "how far the picture has moved since start", |s| s.vision.health.camera_moved_px],
+    [79, V2_0, "camera_error", U16, "mm", 100.0, "the largest error that it causes, of a place or of a dimension", |s| s.vision.health.camera_error_mm],
+    [80, V2_0, "blur", U16, "px", 100.0, "standard deviation of the picture's blur; 0: not known", |s| s.vision.health.blur_px.unwrap_or(0.0)],
+    [81, V2_0, "light_region", U16, "", 1.0, "the part of the picture whose light has changed most since start: 4 columns and 3 rows, from 1 at the top left, row by row; 0: not known", |s| f64::from(s.vision.health.light_region)],
+    [82, V2_0, "light_change", I16, "%", 1.0, "by how much", |s| 100.0 * s.vision.health.light_change],
 ];
 
 /// What a PLC writes, from [`COMMAND`] on.
@@ -552,7 +574,7 @@ mod tests {
         assert_eq!(status.reason(), 3);
         assert!(status.reasons().eq([3, 6, 11]));
         let codes = REASONS.iter().map(|(code, _)| *code);
-        assert!(codes.eq(0..21));
+        assert!(codes.eq(0..26));
     }
 
     #[test]

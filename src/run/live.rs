@@ -199,6 +199,12 @@ struct StatusFile {
     log_lines_dropped: u64,
     imports: u16,
     import_result: u16,
+    camera_watch: u16,
+    camera_moved_px: f64,
+    camera_error_mm: f64,
+    blur_px: Option<f64>,
+    light_region: u16,
+    light_change: f64,
 }
 
 /// Written beside and renamed, so that a reader sees all of it. One that cannot be written is no
@@ -222,6 +228,12 @@ fn write_status(path: &Path, progress: &Progress) {
         log_lines_dropped: log::lines_dropped(),
         imports: status.import.count,
         import_result: status.import.result,
+        camera_watch: status.health.camera_watch,
+        camera_moved_px: status.health.camera_moved_px,
+        camera_error_mm: status.health.camera_error_mm,
+        blur_px: status.health.blur_px,
+        light_region: status.health.light_region,
+        light_change: status.health.light_change,
     };
     let mut new = path.as_os_str().to_owned();
     new.push(".new");

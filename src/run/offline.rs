@@ -6,6 +6,7 @@ use super::{Annotator, memory};
 use crate::config::Site;
 use crate::error::{Error, Result};
 use crate::event::{Counters, ParcelRecord};
+use crate::health::{Condition, Level};
 use crate::image::Plane;
 use crate::pipeline::Pipeline;
 use crate::source::FrameSource;
@@ -103,6 +104,9 @@ pub fn measure(
             if let Some(doubt) = belt_doubt(&pipeline) {
                 observer.doubt(&doubt);
             }
+            if let Some(doubt) = condition_doubt(&pipeline.condition()) {
+                observer.doubt(&doubt);
+            }
             if let Some(explainer) = explainer {
                 explainer.finish(&pipeline)?;
             }
@@ -121,6 +125,26 @@ fn gap_doubt(frames: u64) -> Option<String> {
              times and speeds are wrong by as much: record without dropping frames"
         )
     })
+}
+
+/// What of the instrument is not as it was at the start of a recording.
+fn condition_doubt(condition: &Condition) -> Option<String> {
+    let Condition { place, sharpness, light } = condition;
+    let moved = (place.level > Level::Good).then(|| {
+        format!(
+            "the camera has moved by {:.2} px: places or dimensions are wrong by up to {:.1} mm since then",
+            place.moved.picture_px, place.moved.error_mm
+        )
+    });
+    let unsharp = sharpness.blur_px.filter(|_| sharpness.level > Level::Good).map(|px| {
+        format!("the picture is blurred by {px:.1} px: heights are wrong; focus or clean the lens")
+    });
+    let other_light = (light.level > Level::Good).then(|| {
+        let (percent, region) = (100.0 * light.change, light.region);
+        format!("the light has changed by {percent:.0} % in part {region} of the picture (4 x 3, from the top left)")
+    });
+    let all: Vec<String> = [moved, unsharp, other_light].into_iter().flatten().collect();
+    (!all.is_empty()).then(|| all.join("; "))
 }
 
 /// What of the belt is not as the configuration says, at the end of a recording.

@@ -81,6 +81,18 @@ pub struct CameraState {
     pub frames_torn: u64,
     /// The slowest frame in the pipeline.
     pub frame_time_max_ms: f64,
+    /// Whether it is seen when it moves: 0 being learned, 1 no, 2 across travel, 3 along travel, 4 yes.
+    pub watch: u16,
+    /// How far its picture has moved since start.
+    pub moved_px: f64,
+    /// The largest error that this causes.
+    pub moved_error_mm: f64,
+    /// Standard deviation of its blur; `None`: not known.
+    pub blur_px: Option<f64>,
+    /// The part of the picture whose light has changed most, from 1, of 4 columns and 3 rows; 0: not known.
+    pub light_region: u16,
+    /// Its brightness over that at start, less 1.
+    pub light_change: f64,
 }
 
 /// The belt.

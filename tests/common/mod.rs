@@ -1,6 +1,8 @@
 //! What several tests share: the command, scratch folders and the shared data.
 #![allow(dead_code)] // each test uses its part
 
+pub mod truth;
+
 use beltgauge::config::Site;
 use beltgauge::event::ParcelRecord;
 use beltgauge::image::Plane;

@@ -3,6 +3,7 @@
 pub mod bits;
 pub mod box_filter;
 pub mod flow;
+pub mod gradient;
 pub mod mixture;
 pub mod profile;
 pub mod remap;

@@ -5,10 +5,12 @@ use crate::belt::Encoder;
 use crate::config::Realtime;
 use crate::error::{Error, Result};
 use crate::event::ParcelRecord;
+use crate::health::{Condition, Level};
 use crate::image::Plane;
 use crate::pipeline::{Health, Pipeline};
 use crate::plan::Block;
 use crate::plc::command::Request;
+use crate::plc::health::{Concern, HealthStatus};
 use crate::plc::registers::BeltStatus;
 use crate::run::desk::Photographer;
 use crate::run::realtime;
@@ -142,6 +144,7 @@ impl Vision<'_> {
         status.belt_travel_mm = self.pipeline.belt_position().travel_mm;
         status.time_s = time_s;
         status.belt = belt_status(&self.pipeline.health());
+        status.health = health_status(&self.pipeline.condition());
         progress.frame_time_max = progress.frame_time_max.max(frame_time);
     }
 }
@@ -155,5 +158,28 @@ fn belt_status(health: &Health) -> BeltStatus {
         hides_parcels: health.belt_hides_parcels,
         encoder_ratio: health.encoder_ratio.map(|(ratio, _)| ratio),
         encoder_disagrees: health.encoder_disagrees,
+    }
+}
+
+fn health_status(condition: &Condition) -> HealthStatus {
+    let Condition { place, sharpness, light } = condition;
+    HealthStatus {
+        camera_watch: place.watching as u16,
+        camera_moved_px: place.moved.picture_px,
+        camera_error_mm: place.moved.error_mm,
+        camera: concern(place.level),
+        blur_px: sharpness.blur_px,
+        blur: concern(sharpness.level),
+        light_region: u16::from(light.region),
+        light_change: light.change,
+        light: concern(light.level),
+    }
+}
+
+fn concern(level: Level) -> Concern {
+    match level {
+        Level::Good => Concern::None,
+        Level::Warning => Concern::Warning,
+        Level::Fault => Concern::Fault,
     }
 }

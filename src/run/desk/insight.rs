@@ -173,6 +173,12 @@ impl web::Machine for Insight {
                 frames_lost: vision.frames_lost,
                 frames_torn: vision.frames_torn,
                 frame_time_max_ms: frame_time_max.as_secs_f64() * 1e3,
+                watch: vision.health.camera_watch,
+                moved_px: vision.health.camera_moved_px,
+                moved_error_mm: vision.health.camera_error_mm,
+                blur_px: vision.health.blur_px,
+                light_region: vision.health.light_region,
+                light_change: vision.health.light_change,
             },
             belt: web::BeltState {
                 speed_mm_per_s: vision.belt_speed_mm_per_s,

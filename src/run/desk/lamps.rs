@@ -4,13 +4,15 @@ use crate::plc::registers::Status;
 use crate::web::Lamp;
 
 /// Which lamp a code lights: `None` lets `running` go out without any other.
-pub const LAMPS: [(u16, Option<&str>); 20] = [
+pub const LAMPS: [(u16, Option<&str>); 25] = [
     (1, Some(FAILURE)),
     (2, Some(FAILURE)),
     (3, Some(FAILURE)),
     (4, Some(FAILURE)),
     (12, Some(FAILURE)),
     (7, Some(FAILURE)),
+    (22, Some(FAILURE)),
+    (24, Some(FAILURE)),
     (10, Some(MAINTENANCE)),
     (11, Some(MAINTENANCE)),
     (13, Some(MAINTENANCE)),
@@ -19,6 +21,9 @@ pub const LAMPS: [(u16, Option<&str>); 20] = [
     (6, Some(MAINTENANCE)),
     (15, Some(MAINTENANCE)),
     (20, Some(MAINTENANCE)),
+    (21, Some(MAINTENANCE)),
+    (23, Some(MAINTENANCE)),
+    (25, Some(MAINTENANCE)),
     (16, Some(UNCERTAIN)),
     (17, Some(UNCERTAIN)),
     (18, Some(UNCERTAIN)),

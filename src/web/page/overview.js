@@ -63,6 +63,9 @@ function figuresOf(state) {
     ["figure.slowest", `${number(camera.frame_time_max_ms)} ms`],
     ["figure.camera", `${camera.size_px.join(" × ")} px`],
     ["figure.losses", count(camera.losses)],
+    ["figure.watch", camera.watch < 2 ? t(`figure.watch_${camera.watch}`) : `${number(camera.moved_px, 2)} px = ${number(camera.moved_error_mm, 2)} mm${t(`figure.watch_${camera.watch}`)}`],
+    ["figure.blur", camera.blur_px === null ? t("figure.not_known") : `${number(camera.blur_px, 2)} px`],
+    ["figure.light", camera.light_region === 0 ? t("figure.watch_0") : t("figure.light_part", { change: number(100 * camera.light_change, 0), row: Math.ceil(camera.light_region / 4), column: (camera.light_region - 1) % 4 + 1 })],
   ];
   if (belt.encoder_ratio !== null) figures.push(["figure.encoder_ratio", number(belt.encoder_ratio, 4)]);
   figures.push(["figure.archive", archive.enabled ? t("figure.archive_used", { used: bytes(archive.bytes), most: bytes(archive.bytes_max) }) : t("figure.archive_none")]);
