@@ -98,13 +98,22 @@ impl Broker {
         crate::wait_for("the broker", || TcpStream::connect(self.address).ok());
     }
 
-    /// End it by a signal.
+    /// Hold it: what it is sent meanwhile it has not read.
+    ///
+    /// # Panics
+    /// When it does not run.
+    pub fn hold(&self) {
+        signal(self.child.as_ref().expect("runs"), Signal::STOP);
+    }
+
+    /// End it by a signal, also when it is held.
     ///
     /// # Panics
     /// When it does not run.
     pub fn end(&mut self, by: Signal) {
         let mut child = self.child.take().expect("runs");
         signal(&child, by);
+        signal(&child, Signal::CONT);
         child.wait().expect("a child");
     }
 

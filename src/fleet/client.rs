@@ -72,6 +72,8 @@ impl Connection {
             .set_clean_start(true)
             .set_connect_timeout(CONNECT_TIMEOUT)
             .set_max_packet_size(Some(PACKET_BYTES_MAX))
+            // Without, the crate has tables for 65,535 of them, 18 MiB.
+            .set_outgoing_inflight_upper_limit(IN_FLIGHT_MAX as u16)
             .set_last_will(LastWill::new(topic, will, QoS::AtLeastOnce, true, None))
             .set_socket_connector(move |_, _| way.clone().dial());
         if let Some((user, password)) = account.login.clone() {
