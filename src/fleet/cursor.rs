@@ -10,7 +10,7 @@ const CURSOR: &str = "fleet.cursor";
 const SERIAL: &str = "fleet.serial";
 /// Of either file.
 const BYTES_MAX: u64 = 1024;
-/// Two machines of ten thousand have the same one with a chance of one in 10^11.
+/// Among ten thousand machines two have the same one with a chance of 3 in 10^12.
 const SERIAL_BYTES: usize = 8;
 
 /// The last entry of the archive that the broker has acknowledged, and all before it.
@@ -76,7 +76,7 @@ impl Kept {
                 let mut bytes = [0; SERIAL_BYTES];
                 let random = std::fs::File::open("/dev/urandom");
                 random.and_then(|mut file| file.read_exact(&mut bytes)).map_err(failed)?;
-                let serial: String = bytes.iter().map(|byte| format!("{byte:02x}")).collect();
+                let serial = format!("{:016x}", u64::from_le_bytes(bytes));
                 std::fs::create_dir_all(&self.folder).map_err(failed)?;
                 files::replace(&path, format!("{serial}\n").as_bytes()).map_err(failed)?;
                 Ok(serial)

@@ -199,13 +199,16 @@ struct Outbox {
     acknowledged: u64,
 }
 
+/// Where messages come from, unless that could not be read, and those that there were.
+type Read = (Option<Feed>, std::result::Result<Filled, String>);
+
 /// What belongs to one connection.
 struct Visit {
     connection: Connection,
     in_flight: VecDeque<(Origin, Acknowledgment)>,
     /// Here, or away to read.
     feed: Option<Feed>,
-    reading: Option<JoinHandle<(Option<Feed>, std::result::Result<Filled, String>)>>,
+    reading: Option<JoinHandle<Read>>,
     look_at: Instant,
     health_at: Instant,
     asked: Vec<Ongoing>,
@@ -361,36 +364,30 @@ impl Outbox {
         if visit.reading.is_some() || room < IN_FLIGHT_MAX / 2 || Instant::now() < visit.look_at {
             return;
         }
-        let (feed, sender, machine) =
-            (visit.feed.take(), self.sender.clone(), Arc::clone(&self.machine));
-        let (cursor, is_checked, replays) = (self.cursor, self.is_checked, self.replays.clone());
         let asked = std::mem::take(&mut visit.asked);
-        visit.reading = Some(spawn_blocking(move || {
-            let mut feed = match feed {
-                Some(mut feed) => {
-                    asked.into_iter().for_each(|ongoing| feed.replay(ongoing));
-                    feed
-                }
-                None => {
-                    let cursor =
-                        if is_checked { Ok(cursor) } else { feed::checked(cursor, &*machine) };
-                    match cursor {
-                        Ok(cursor) => Feed::new(sender, machine, cursor, &replays),
-                        Err(e) => return (None, Err(e)),
-                    }
-                }
-            };
-            let filled = feed.fill(room);
-            (Some(feed), filled)
+        let made = visit.feed.take().map(|mut feed| {
+            for ongoing in asked {
+                feed.replay(ongoing);
+            }
+            feed
+        });
+        let (sender, machine) = (self.sender.clone(), Arc::clone(&self.machine));
+        let (cursor, is_checked, replays) = (self.cursor, self.is_checked, self.replays.clone());
+        let make = move || {
+            let cursor = if is_checked { cursor } else { feed::checked(cursor, &*machine)? };
+            Ok(Feed::new(sender, machine, cursor, &replays))
+        };
+        visit.reading = Some(spawn_blocking(move || match made.map_or_else(make, Ok) {
+            Ok(mut feed) => {
+                let filled = feed.fill(room);
+                (Some(feed), filled)
+            }
+            Err(e) => (None, Err(e)),
         }));
     }
 
     /// What was read goes on its way.
-    fn take(
-        &mut self,
-        visit: &mut Visit,
-        (feed, filled): (Option<Feed>, std::result::Result<Filled, String>),
-    ) -> std::result::Result<(), String> {
+    fn take(&mut self, visit: &mut Visit, (feed, filled): Read) -> std::result::Result<(), String> {
         (visit.feed, visit.reading) = (feed, None);
         match filled {
             Ok(Filled { messages, more }) => {
@@ -503,8 +500,6 @@ async fn first(
         None => std::future::pending().await,
     }
 }
-
-type Read = (Option<Feed>, std::result::Result<Filled, String>);
 
 /// What was read; never, if nothing is being read.
 async fn read(reading: &mut Option<JoinHandle<Read>>) -> Read {
