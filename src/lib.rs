@@ -17,7 +17,8 @@
 //! - [`source`]: where frames come from, and what records them. [`plc`]: how records reach the PLC.
 //! - [`store`]: the appliance's disk: configurations in force, sticks, whom it trusts.
 //! - [`archive`]: parcels with pictures, and events, on the disk. [`web`]: the page that shows all this.
-//! - [`run`]: threads and rings; the only room that knows source, pipeline, plc, store, archive and web.
+//! - [`fleet`]: the site's broker, which many machines report to.
+//! - [`run`]: threads and rings; the only room that knows source, pipeline, plc, store, archive, web and fleet.
 //!
 //! Invariants: `pipeline::step` reads no clock and allocates nothing; every parcel is told once, also
 //! over frames that are missing (`pipeline/gap.rs` says how); dependencies point one way
@@ -31,6 +32,7 @@ pub mod camera;
 pub mod config;
 pub mod error;
 pub mod event;
+pub mod fleet;
 pub mod health;
 pub mod image;
 pub mod kernel;

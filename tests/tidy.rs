@@ -29,6 +29,7 @@ const MAY_USE: &[(&str, &[&str])] = &[
     ("store", &["camera", "config", "error"]),
     ("archive", &["error"]),
     ("web", &["config", "event", "error"]),
+    ("fleet", &["config", "event", "store", "error"]),
 ];
 
 /// The only places for `unsafe`.

@@ -5,6 +5,7 @@ pub mod allocations;
 pub mod appliance;
 pub mod browser;
 pub mod can_peer;
+pub mod fleet;
 pub mod machine;
 #[cfg(feature = "opencv")]
 pub mod opencv_chain;
@@ -62,6 +63,14 @@ impl Demo {
     /// # Panics
     /// When it does not start or its server does not answer.
     pub fn start(name: &str, seconds: u32, pin: bool) -> Self {
+        Self::start_with(name, seconds, pin, &[])
+    }
+
+    /// The same with more arguments.
+    ///
+    /// # Panics
+    /// When it does not start or its server does not answer.
+    pub fn start_with(name: &str, seconds: u32, pin: bool, more: &[&str]) -> Self {
         let binary = beltgauge();
         let free = [(); 2].map(|()| TcpListener::bind("127.0.0.1:0").expect("a free port"));
         let [address, page] = free.each_ref().map(|socket| socket.local_addr().expect("bound"));
@@ -87,6 +96,7 @@ impl Demo {
                 "--out",
             ])
             .arg(&out)
+            .args(more)
             .stdout(Stdio::null())
             .stderr(Stdio::null())
             .spawn()

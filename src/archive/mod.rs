@@ -2,7 +2,8 @@
 //!
 //! ```text
 //! desk -> [ring of entries] -> writer thread -> segments 00000000000000000001.bga, ...
-//!                                                   '-> Reader: page, `beltgauge archive`
+//!                                                   |-> Reader: page, `beltgauge archive`
+//!                                                   '-> Follower: fleet
 //! ```
 //! A segment is a head and entries, one after the other; each entry ends with the SHA-256 of the one
 //! before it and itself, over segments too. A power cut costs what was not yet synchronised, a second's
@@ -11,10 +12,12 @@
 //! was noted elsewhere. What is damaged or cannot be read is told and left as it is: a new segment goes
 //! on behind it. A slow, full or broken disk costs entries, which are counted: nobody waits for it.
 
+mod follow;
 mod reader;
 mod segment;
 mod writer;
 
+pub use follow::Follower;
 pub use reader::{Reader, Stored, Verdict};
 pub use writer::{Archive, Condition};
 

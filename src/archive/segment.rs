@@ -205,6 +205,16 @@ impl Segment {
         Ok(Some((head, entry, [written, sum])))
     }
 
+    /// The sum of all before an entry, as [`Segment::pass`] told where it is.
+    pub fn sum_before(&mut self, offset: u64) -> std::io::Result<Sum> {
+        let mut sum = self.head.before;
+        if offset > HEAD_BYTES as u64 {
+            self.seek(offset - SUM_BYTES as u64)?;
+            fill(&mut self.file, &mut sum)?;
+        }
+        Ok(sum)
+    }
+
     /// Go to an entry, as [`Segment::pass`] told where it is.
     pub fn seek(&mut self, offset: u64) -> std::io::Result<()> {
         self.file.seek(SeekFrom::Start(offset))?;

@@ -350,3 +350,69 @@ fn what_cannot_be_read_is_passed_over_and_told() {
         Reader::open(&folder).expect("there").before(None, 9).expect("the rest is readable");
     assert_eq!(found.len(), 5);
 }
+
+/// Numbers of what follows, read so many at a time.
+fn follow(follower: &mut Follower, limit: usize) -> Vec<u64> {
+    let found = follower.read(limit).expect("readable");
+    assert!(found.iter().all(|stored| stored.entry.picture.is_empty()));
+    found.iter().map(|stored| stored.number).collect()
+}
+
+#[test]
+fn a_follower_reads_every_entry_once_in_order_while_they_are_written() {
+    let folder = folder("follow");
+    let mut follower = Follower::after(&folder, 0);
+    assert!(follow(&mut follower, 9).is_empty(), "nothing is there yet");
+    let archive = Archive::start(&folder, 16 * MIB).expect("starts");
+    let (mut read, mut written) = (Vec::<u64>::new(), 0);
+    for (part, limit) in [(1, 64), (70, 7), (3, 1), (26, 64)] {
+        write(&archive, (written + 1..=written + part).map(|i| entry(i, 100_000)));
+        written += part;
+        loop {
+            let found = follow(&mut follower, limit);
+            read.extend(&found);
+            if found.len() < limit {
+                break;
+            }
+        }
+        assert_eq!(read, (1..=written).collect::<Vec<_>>());
+    }
+    assert!(list(&folder).expect("readable").len() > 1, "several segments");
+    assert_eq!(follow(&mut Follower::after(&folder, 42), 3), [43, 44, 45]);
+    assert!(follow(&mut Follower::after(&folder, written), 3).is_empty());
+    archive.finish(PATIENCE);
+}
+
+#[test]
+fn a_follower_passes_over_what_is_gone_torn_or_damaged() {
+    let folder = folder("follow-gone");
+    let archive = Archive::start(&folder, 16 * MIB).expect("starts");
+    write(&archive, (1..=400).map(|i| entry(i, 100_000)));
+    archive.finish(PATIENCE);
+    let segments = list(&folder).expect("readable");
+    let (oldest, second) = (segments[0].0, segments[1].0);
+    assert!(oldest > 1, "the oldest are gone");
+    assert_eq!(follow(&mut Follower::after(&folder, 0), 2), [oldest, oldest + 1]);
+    // The head of its fourth entry: what is behind it is not found. Before that, a picture.
+    let fourth = fs::read(&segments[0].1).expect("there");
+    let is_head = |at: &usize| fourth[*at..].starts_with(b"BGEN");
+    let at = (0..fourth.len()).filter(is_head).nth(3).expect("more than three") as u64;
+    let damaged = fs::OpenOptions::new().write(true).open(&segments[0].1).expect("there");
+    let overwrite = |at| std::os::unix::fs::FileExt::write_all_at(&damaged, &[7; 4], at);
+    overwrite(at).and_then(|()| overwrite(at - 1000)).expect("room");
+    let due = [oldest, oldest + 1, oldest + 2, second, second + 1];
+    let mut follower = Follower::after(&folder, 0);
+    let found = follower.read(5).expect("readable");
+    assert!(found.iter().map(|stored| stored.number).eq(due));
+    assert!(
+        found.iter().map(|stored| stored.entry.kind == Kind::Gap).eq(due.map(|n| n == oldest + 2))
+    );
+    // Its last entry is not whole: it is not read, and then it is.
+    let path = newest(&folder);
+    let whole = fs::read(&path).expect("there");
+    fs::write(&path, &whole[..whole.len() - 1]).expect("room");
+    let mut follower = Follower::after(&folder, 398);
+    assert_eq!(follow(&mut follower, 9), [399]);
+    fs::write(&path, &whole).expect("room");
+    assert_eq!(follow(&mut follower, 9), [400]);
+}

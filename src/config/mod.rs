@@ -1,6 +1,7 @@
 //! TOML -> validated [`Config`]. Every key but those of the smallest configuration has a default;
 //! unknown keys are refused; a wrong value names file, key, value, allowed range and remedy.
 
+mod fleet;
 mod health;
 mod json_schema;
 mod plc;
@@ -8,6 +9,7 @@ mod ranges;
 mod schema;
 mod service;
 
+pub use fleet::Fleet;
 pub use health::Health;
 pub use json_schema::json_schema;
 pub use plc::{Can, DimensionOrder, Encoder, Modbus, Plc, WordOrder};
@@ -55,7 +57,9 @@ impl Site {
     /// Files that the configuration names are beside it.
     pub fn beside(&mut self, path: &Path) {
         let folder = path.parent().unwrap_or(Path::new("."));
-        let named = [&mut self.config.plc.state_file, &mut self.config.archive.folder];
+        let Config { plc, archive, fleet, .. } = &mut self.config;
+        let named =
+            [&mut plc.state_file, &mut archive.folder, &mut fleet.login_file, &mut fleet.ca_file];
         for file in named.into_iter().flatten() {
             *file = folder.join(&*file);
         }

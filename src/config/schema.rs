@@ -1,5 +1,6 @@
 //! The keys of the configuration file, their defaults and ranges.
 
+use super::fleet::Fleet;
 use super::health::Health;
 use super::plc::{Can, Encoder, Modbus, Plc};
 use super::ranges::{self, range};
@@ -66,6 +67,9 @@ pub struct Config {
     /// `[archive]`
     #[serde(default)]
     pub archive: Archive,
+    /// `[fleet]`
+    #[serde(default)]
+    pub fleet: Fleet,
 }
 
 /// How a live camera is reached.
@@ -328,7 +332,7 @@ impl Config {
 
     /// What the table of ranges cannot say.
     fn check(&self) -> Result<()> {
-        let Self { camera, zone, plc, modbus, can, encoder, import, web, .. } = self;
+        let Self { camera, zone, plc, modbus, can, encoder, import, web, fleet, .. } = self;
         camera.check()?;
         for (key, mm) in [
             ("zone.x_max_mm - zone.x_min_mm", zone.x_max_mm - zone.x_min_mm),
@@ -341,6 +345,7 @@ impl Config {
         encoder.check()?;
         check_writers(plc, modbus, can, encoder)?;
         web.check()?;
+        fleet.check()?;
         import.public_key.as_deref().map_or(Ok(()), |key| public_key(key).map(drop))
     }
 }

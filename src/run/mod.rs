@@ -12,6 +12,7 @@ mod demo_kit;
 mod demo_results;
 mod desk;
 mod explain;
+pub mod fleet;
 pub mod import;
 pub mod live;
 pub mod log;

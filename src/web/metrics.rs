@@ -27,13 +27,13 @@ fn figures(s: &State) -> Vec<(&'static str, &'static str, &'static str, f64)> {
         ("frame_time_max_seconds", "gauge", "the slowest frame in the pipeline since start", camera.frame_time_max_ms / 1e3),
         ("camera_watch", "gauge", "whether a camera that moves is seen: 0 being learned, 1 no, 2 across travel, 3 along travel, 4 yes", f64::from(camera.watch)),
         ("camera_moved_pixels", "gauge", "how far the picture has moved since start", camera.moved_px),
-        ("camera_error_millimetres", "gauge", "the largest error that this causes", camera.moved_error_mm),
+        ("camera_error_metres", "gauge", "the largest error that this causes", camera.moved_error_mm / 1e3),
         ("blur_pixels", "gauge", "standard deviation of the picture's blur", camera.blur_px.unwrap_or(nothing)),
         ("light_change_ratio", "gauge", "the largest change of a part's brightness since start", camera.light_change),
-        ("belt_speed_millimetres_per_second", "gauge", "belt speed", belt.speed_mm_per_s),
+        ("belt_speed_metres_per_second", "gauge", "belt speed", belt.speed_mm_per_s / 1e3),
         ("belt_measured", "gauge", "1: the belt's motion is measured, not assumed", flag(belt.measured)),
         ("belt_by_encoder", "gauge", "1: by the encoder", flag(belt.by_encoder)),
-        ("belt_travel_millimetres", "gauge", "belt travel since start", belt.travel_mm),
+        ("belt_travel_metres", "gauge", "belt travel since start", belt.travel_mm / 1e3),
         ("encoder_ratio", "gauge", "the encoder's travel over that of the texture", belt.encoder_ratio.unwrap_or(nothing)),
         ("parcels_total", "counter", "parcels reported, measured or not", count(counts.parcels)),
         ("parcels_unmeasured_total", "counter", "of these, parcels without dimensions", count(counts.parcels_unmeasured)),
@@ -128,5 +128,25 @@ mod tests {
         }
         assert!(text.contains("beltgauge_reason{code=\"12\"} 1\n"));
         assert!(text.contains("beltgauge_encoder_ratio NaN\n"), "what is not known is no number");
+    }
+
+    #[test]
+    fn what_is_shipped_for_prometheus_and_grafana_asks_for_figures_that_there_are() {
+        let text = text(&State { reasons: vec![2], ..State::default() });
+        for (file, asked_min) in [
+            (include_str!("../../config/fleet/alerts.yml"), 10),
+            (include_str!("../../config/fleet/dashboard.json"), 10),
+        ] {
+            let is_part = |c: char| c.is_ascii_lowercase() || c == '_';
+            let names = file.match_indices("beltgauge_").map(|(at, _)| {
+                let rest = &file[at..];
+                &rest[..rest.find(|c| !is_part(c)).unwrap_or(rest.len())]
+            });
+            let names: HashSet<&str> = names.collect();
+            assert!(names.len() >= asked_min, "only {names:?}");
+            for name in names {
+                assert!(text.contains(&format!("# TYPE {name} ")), "there is no {name}");
+            }
+        }
     }
 }

@@ -3,7 +3,7 @@
 //! ```text
 //! source -> [ready ring] -> pipeline -> [records] -> link: Modbus, CAN
 //!    ^------ [free ring] <-----'  ^  |     '-------> observer (console)
-//!                                 |  '-- [shots] --> desk: page, archive
+//!                                 |  '-- [shots] --> desk: page, archive -> fleet
 //!                                 '--- [counts, requests] --- link -- [published] --> desk
 //! ```
 //! A frame buffer is always in exactly one place. When no buffer is free the frame is dropped
@@ -15,6 +15,7 @@ mod plc;
 mod vision;
 
 use super::desk::{self, Desk, Insight, Rings};
+use super::fleet::{self as fleet_side, Lane};
 use super::memory::Carved;
 use super::realtime;
 use super::watchdog::{Beats, Watchdog};
@@ -22,6 +23,7 @@ use crate::belt::Encoder;
 use crate::config::{Config, Site};
 use crate::error::{Error, Result};
 use crate::event::ParcelRecord;
+use crate::fleet;
 use crate::plan::Block;
 use crate::plc::clients::ClientList;
 use crate::plc::command::Request;
@@ -184,6 +186,7 @@ impl Shared {
 impl Appliance {
     /// Bind the PLC's socket, read what a PLC was told before; nothing runs yet.
     pub fn new(site: Site) -> Result<Self> {
+        fleet_side::check(&site.config)?;
         let listener = modbus::bind(&site.config.modbus)?;
         let journal = site.config.plc.state_file.as_deref().map(Journal::open).transpose()?;
         let journal = journal.unwrap_or_default();
@@ -268,11 +271,8 @@ impl Appliance {
                 };
                 services.push(spawn_service(scope, "desk", shared, desk)?);
             }
-            if let Some(page) = page {
-                let (insight, board) = (Arc::clone(&insight), Arc::clone(&board));
-                let web = move || web::serve(&config.web, page, &board, insight);
-                services.push(spawn_service(scope, "web", shared, web)?);
-            }
+            services.extend(spawn_page(scope, config, page, (&board, &insight), shared)?);
+            services.extend(spawn_fleet(scope, config, &insight, shared)?);
             let vision = Vision {
                 pipeline,
                 ready: ready_out,
@@ -377,6 +377,37 @@ fn spawn_service<'scope, 'env>(
         .stack_size(SERVICE_STACK_BYTES)
         .spawn_scoped(scope, told)
         .map_err(|e| Error::failure(format!("cannot start the {name} thread: {e}")))
+}
+
+/// Start the page's thread, if there is a page.
+fn spawn_page<'scope>(
+    scope: &'scope std::thread::Scope<'scope, '_>,
+    config: &'scope Config,
+    page: Option<web::Listening>,
+    (board, insight): (&Arc<Board>, &Arc<Insight>),
+    shared: &'scope Shared,
+) -> Result<Option<Handle<'scope>>> {
+    let Some(page) = page else { return Ok(None) };
+    let (insight, board) = (Arc::clone(insight), Arc::clone(board));
+    let web = move || web::serve(&config.web, page, &board, insight);
+    spawn_service(scope, "web", shared, web).map(Some)
+}
+
+/// Start the fleet's thread, if there is a fleet.
+fn spawn_fleet<'scope>(
+    scope: &'scope std::thread::Scope<'scope, '_>,
+    config: &'scope Config,
+    insight: &Arc<Insight>,
+    shared: &'scope Shared,
+) -> Result<Option<Handle<'scope>>> {
+    let (Some(_), Some(folder)) = (config.fleet.broker, &config.archive.folder) else {
+        return Ok(None);
+    };
+    let lane = Lane { insight: Arc::clone(insight), archive: folder.clone() };
+    let lane: Arc<dyn fleet::Machine> = Arc::new(lane);
+    let over = || shared.over.load(Ordering::Acquire);
+    let fleet = move || fleet::serve(&config.fleet, folder, &lane, &over);
+    spawn_service(scope, "fleet", shared, fleet).map(Some)
 }
 
 /// They end in the order of the flow, so that every frame and record arrives.
