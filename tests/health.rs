@@ -196,9 +196,10 @@ fn a_camera_that_was_knocked_is_told_with_how_far() {
         let last = recording.watched(40.0, &knocked, 60.0).last().expect("one").place;
         eprintln!("{name}, turned by {degrees:?} degrees, {true_px:.2} px: {last:?}");
         assert_eq!((last.level, last.watching), (level, Watching::Both), "{name} {degrees:?}");
-        // Large motions are told as if they were small ones.
+        // Large motions are told as if they were small ones: a turn by 2.5 degrees, seen 35 degrees off the axis, is wrong
+        // by tan 2.5 * tan 35 = 3 %, and a third of that for where the edges happen to lie.
         let off_px = (last.moved.picture_px - true_px).abs();
-        assert!(off_px < 0.05 + 0.03 * true_px, "{name} {degrees:?}: off by {off_px} px");
+        assert!(off_px < 0.05 + 0.04 * true_px, "{name} {degrees:?}: off by {off_px} px");
     }
 }
 

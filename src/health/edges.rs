@@ -22,6 +22,8 @@ const LOOKS: usize = 12;
 /// that a belt that repeats itself is not seen in the same place.
 const LOOK_MM: f64 = 40.0;
 const LOOK_MORE_MM: f64 = 7.0;
+/// One row in so many is looked at: edges are longer than that, and memory is dear.
+const ROW_STEP: usize = 2;
 /// One frame looks at one band of rows.
 const BANDS: usize = 32;
 /// Cells along and across the picture.
@@ -103,8 +105,9 @@ pub(super) struct Finder {
 
 impl Finder {
     pub(super) fn plan([width, height]: [usize; 2], plan: &mut Plan) {
-        plan.add::<i8>("health.along", width * height, "least gradient along x of each raw pixel");
-        plan.add::<i8>("health.across", width * height, "least gradient along y of each raw pixel");
+        let n = width * height.div_ceil(ROW_STEP);
+        plan.add::<i8>("health.along", n, "least gradient along x of raw pixels");
+        plan.add::<i8>("health.across", n, "least gradient along y of raw pixels");
         plan.add::<[u16; 2]>("health.zone", height, "where the zone lies in each raw row");
         plan.add::<Candidate>("health.candidates", POINTS_MAX, "two edges of each cell");
     }
@@ -131,8 +134,9 @@ impl Finder {
             self.due_mm = travel_mm + LOOK_MM + LOOK_MORE_MM * self.look as f64;
         }
         let rows = self.size_px[1].div_ceil(BANDS);
-        let first = (self.band * rows).max(1);
-        for y in first..(self.band * rows + rows).min(self.size_px[1] - 1) {
+        let first = (self.band * rows).max(ROW_STEP).next_multiple_of(ROW_STEP);
+        let end = (self.band * rows + rows).min(self.size_px[1] - ROW_STEP);
+        for y in (first..end).step_by(ROW_STEP) {
             if self.look < LOOKS {
                 self.look_at_row(raw, y);
             } else {
@@ -145,7 +149,8 @@ impl Finder {
     }
 
     fn look_at_row(&mut self, raw: Plane<'_>, y: usize) {
-        let row = y * self.size_px[0]..(y + 1) * self.size_px[0];
+        let width = self.size_px[0];
+        let row = y / ROW_STEP * width..(y / ROW_STEP + 1) * width;
         let least = [&mut self.along[row.clone()], &mut self.across[row]];
         keep_least([raw.row(y - 1), raw.row(y), raw.row(y + 1)], least, self.look == 0);
     }
@@ -154,7 +159,7 @@ impl Finder {
     fn choose_in_row(&mut self, y: usize) {
         let [width, height] = self.size_px;
         let [from, to] = self.zone[y].map(usize::from);
-        let at = |plane: &[i8], x: usize, y: usize| plane[y * width + x].unsigned_abs();
+        let at = |plane: &[i8], x: usize, y: usize| plane[y / ROW_STEP * width + x].unsigned_abs();
         let room =
             |at: usize, size: usize| (MARGIN_PX..size.saturating_sub(MARGIN_PX)).contains(&at);
         for x in (1..width - 1).filter(|x| !(from..=to).contains(x)) {
@@ -170,7 +175,8 @@ impl Finder {
                     room(x, width),
                 ),
                 Axis::Column => (
-                    gy >= at(&self.across, x, y - 1) && gy > at(&self.across, x, y + 1),
+                    gy >= at(&self.across, x, y - ROW_STEP)
+                        && gy > at(&self.across, x, y + ROW_STEP),
                     room(y, height),
                 ),
             };
