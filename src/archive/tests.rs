@@ -19,6 +19,11 @@ fn folder(name: &str) -> PathBuf {
     folder
 }
 
+/// On a disk with room, however full the disk is that the tests run on.
+fn start(folder: &Path, bytes_max: u64) -> crate::error::Result<Archive> {
+    Archive::start_on(folder, bytes_max, |_| Ok(Space { all: 2048 * MIB, free: 1024 * MIB }))
+}
+
 fn entry(i: u64, bytes: usize) -> Entry {
     Entry {
         kind: Kind::Parcel,
@@ -49,7 +54,7 @@ fn newest(folder: &Path) -> PathBuf {
 #[test]
 fn what_was_written_is_read_again_newest_first_and_the_chain_holds() {
     let folder = folder("whole");
-    let archive = Archive::start(&folder, 64 * MIB).expect("starts");
+    let archive = start(&folder, 64 * MIB).expect("starts");
     write(&archive, (1..=120).map(|i| entry(i, 100_000)));
     archive.finish(PATIENCE);
     assert!(list(&folder).expect("readable").len() > 1, "several segments");
@@ -72,7 +77,7 @@ fn what_was_written_is_read_again_newest_first_and_the_chain_holds() {
 fn it_goes_on_where_it_ended_and_the_oldest_go_first() {
     let folder = folder("goes-on");
     for run in 0..3 {
-        let archive = Archive::start(&folder, 16 * MIB).expect("starts");
+        let archive = start(&folder, 16 * MIB).expect("starts");
         write(&archive, (1..=100).map(|i| entry(100 * run + i, 100_000)));
         let condition = archive.condition();
         assert!(condition.bytes <= 16 * MIB && condition.lost == 0, "{condition:?}");
@@ -92,7 +97,7 @@ fn it_goes_on_where_it_ended_and_the_oldest_go_first() {
 #[test]
 fn a_power_cut_at_any_byte_costs_the_entry_that_was_being_written_and_nothing_else() {
     let folder = folder("power");
-    let archive = Archive::start(&folder, 64 * MIB).expect("starts");
+    let archive = start(&folder, 64 * MIB).expect("starts");
     write(&archive, (1..=5).map(|i| entry(i, 40)));
     archive.finish(PATIENCE);
     let path = newest(&folder);
@@ -103,7 +108,7 @@ fn a_power_cut_at_any_byte_costs_the_entry_that_was_being_written_and_nothing_el
         fs::create_dir_all(&folder).expect("room");
         fs::write(&path, &whole[..length]).expect("room");
         let left = length.saturating_sub(HEAD_BYTES) / entry_bytes;
-        let archive = Archive::start(&folder, 64 * MIB).expect("starts");
+        let archive = start(&folder, 64 * MIB).expect("starts");
         write(&archive, (101..=102).map(|i| entry(i, 40)));
         archive.finish(PATIENCE);
         let reader = Reader::open(&folder).expect("there");
@@ -117,7 +122,7 @@ fn a_power_cut_at_any_byte_costs_the_entry_that_was_being_written_and_nothing_el
 #[test]
 fn a_changed_a_missing_and_a_swapped_entry_show() {
     let folder = folder("changed");
-    let archive = Archive::start(&folder, 64 * MIB).expect("starts");
+    let archive = start(&folder, 64 * MIB).expect("starts");
     write(&archive, (1..=250).map(|i| entry(i, 100_000)));
     archive.finish(PATIENCE);
     let reader = Reader::open(&folder).expect("there");
@@ -145,7 +150,7 @@ fn a_disk_that_does_not_obey_costs_entries_that_are_counted_and_told() {
     // A file where the folder should be: nothing can be written there.
     let inside = folder.join("archive");
     fs::write(&inside, "in the way").expect("room");
-    let archive = Archive::start(&inside, 64 * MIB).expect("starts all the same");
+    let archive = start(&inside, 64 * MIB).expect("starts all the same");
     write(&archive, (1..=3).map(|i| entry(i, 10)));
     let condition = archive.condition();
     assert_eq!((condition.written, condition.lost), (0, 3));
@@ -170,7 +175,7 @@ fn more_entries_than_the_ring_holds_are_counted_and_nobody_waits() {
     // Opening a pipe waits for ever: the slowest disk there is.
     let pipe = std::process::Command::new("mkfifo").arg(inside.join("lock")).status();
     assert!(pipe.is_ok_and(|status| status.success()));
-    let archive = Archive::start(&inside, 64 * MIB).expect("starts");
+    let archive = start(&inside, 64 * MIB).expect("starts");
     (1..=1000).for_each(|i| archive.put(entry(i, 10)));
     let condition = archive.condition();
     // One may be in the writer's hands.
@@ -227,9 +232,9 @@ fn a_disk_that_does_not_answer_is_told_while_it_is_so_before_anything_is_lost() 
 #[test]
 fn two_processes_do_not_write_one_archive() {
     let folder = folder("two");
-    let first = Archive::start(&folder, 64 * MIB).expect("starts");
+    let first = start(&folder, 64 * MIB).expect("starts");
     write(&first, std::iter::once(entry(1, 10)));
-    let second = Archive::start(&folder, 64 * MIB).expect("starts");
+    let second = start(&folder, 64 * MIB).expect("starts");
     write(&second, std::iter::once(entry(2, 10)));
     assert!(second.condition().fault.is_some_and(|fault| fault.contains("another process")));
     first.finish(PATIENCE);
@@ -243,6 +248,11 @@ fn small_disk(folder: &Path) -> std::io::Result<Space> {
         used += fs::metadata(path)?.len();
     }
     Ok(Space { all: 64 * MIB, free: (64 * MIB).saturating_sub(used) })
+}
+
+/// A large disk that others have nearly filled.
+fn large_disk(_: &Path) -> std::io::Result<Space> {
+    Ok(Space { all: 252 << 30, free: 300 * MIB })
 }
 
 fn full_disk(folder: &Path) -> std::io::Result<Space> {
@@ -267,6 +277,15 @@ fn it_leaves_room_on_a_disk_that_is_smaller_than_it_may_be() {
     archive.finish(PATIENCE);
 }
 
+#[test]
+fn a_large_disk_that_others_have_nearly_filled_takes_entries() {
+    let folder = folder("large");
+    let archive = Archive::start_on(&folder, 64 * MIB, large_disk).expect("starts");
+    write(&archive, (1..=5).map(|i| entry(i, 40)));
+    assert!(!archive.condition().is_bad(), "{:?}", archive.condition());
+    archive.finish(PATIENCE);
+}
+
 /// What verifying finds, and the newest entry's number.
 fn verified(folder: &Path) -> (Verdict, u64) {
     let verdict = Reader::open(folder).expect("there").verify().expect("readable");
@@ -277,7 +296,7 @@ fn verified(folder: &Path) -> (Verdict, u64) {
 #[test]
 fn damage_in_the_newest_segment_is_no_power_cut_and_no_number_is_given_again() {
     let folder = folder("damaged");
-    let archive = Archive::start(&folder, 64 * MIB).expect("starts");
+    let archive = start(&folder, 64 * MIB).expect("starts");
     write(&archive, (1..=5).map(|i| entry(i, 40)));
     archive.finish(PATIENCE);
     let path = newest(&folder);
@@ -295,7 +314,7 @@ fn damage_in_the_newest_segment_is_no_power_cut_and_no_number_is_given_again() {
         fs::write(&path, &damaged).expect("room");
         let (verdict, _) = verified(&folder);
         assert!(!verdict.broken.is_empty() && verdict.torn_bytes == 0, "byte {at}: {verdict:?}");
-        let archive = Archive::start(&folder, 64 * MIB).expect("starts");
+        let archive = start(&folder, 64 * MIB).expect("starts");
         write(&archive, std::iter::once(entry(6, 40)));
         let condition = archive.condition();
         let name = path.file_name().map(|name| name.to_string_lossy().into_owned());
@@ -314,7 +333,7 @@ fn damage_in_the_newest_segment_is_no_power_cut_and_no_number_is_given_again() {
 #[test]
 fn a_tail_of_zeros_is_what_a_power_cut_leaves() {
     let folder = folder("zeros");
-    let archive = Archive::start(&folder, 64 * MIB).expect("starts");
+    let archive = start(&folder, 64 * MIB).expect("starts");
     write(&archive, (1..=3).map(|i| entry(i, 40)));
     archive.finish(PATIENCE);
     let path = newest(&folder);
@@ -323,7 +342,7 @@ fn a_tail_of_zeros_is_what_a_power_cut_leaves() {
     fs::write(&path, &bytes).expect("room");
     let (verdict, _) = verified(&folder);
     assert!(verdict.broken.is_empty() && verdict.torn_bytes == 10_000, "{verdict:?}");
-    let archive = Archive::start(&folder, 64 * MIB).expect("starts");
+    let archive = start(&folder, 64 * MIB).expect("starts");
     write(&archive, std::iter::once(entry(4, 40)));
     assert_eq!(archive.condition().damaged, None);
     archive.finish(PATIENCE);
@@ -333,12 +352,12 @@ fn a_tail_of_zeros_is_what_a_power_cut_leaves() {
 #[test]
 fn what_cannot_be_read_is_passed_over_and_told() {
     let folder = folder("unreadable");
-    let archive = Archive::start(&folder, 64 * MIB).expect("starts");
+    let archive = start(&folder, 64 * MIB).expect("starts");
     write(&archive, (1..=3).map(|i| entry(i, 40)));
     archive.finish(PATIENCE);
     // A folder opens and cannot be read, as a file on a bad sector.
     fs::create_dir(folder.join(format!("{:020}.bga", 4))).expect("room");
-    let archive = Archive::start(&folder, 64 * MIB).expect("starts");
+    let archive = start(&folder, 64 * MIB).expect("starts");
     write(&archive, std::iter::once(entry(6, 40)));
     let condition = archive.condition();
     assert!(condition.written == 1 && condition.fault.is_none(), "{condition:?}");
@@ -363,7 +382,7 @@ fn a_follower_reads_every_entry_once_in_order_while_they_are_written() {
     let folder = folder("follow");
     let mut follower = Follower::after(&folder, 0);
     assert!(follow(&mut follower, 9).is_empty(), "nothing is there yet");
-    let archive = Archive::start(&folder, 16 * MIB).expect("starts");
+    let archive = start(&folder, 16 * MIB).expect("starts");
     let (mut read, mut written) = (Vec::<u64>::new(), 0);
     for (part, limit) in [(1, 64), (70, 7), (3, 1), (26, 64)] {
         write(&archive, (written + 1..=written + part).map(|i| entry(i, 100_000)));
@@ -386,7 +405,7 @@ fn a_follower_reads_every_entry_once_in_order_while_they_are_written() {
 #[test]
 fn a_follower_passes_over_what_is_gone_torn_or_damaged() {
     let folder = folder("follow-gone");
-    let archive = Archive::start(&folder, 16 * MIB).expect("starts");
+    let archive = start(&folder, 16 * MIB).expect("starts");
     write(&archive, (1..=400).map(|i| entry(i, 100_000)));
     archive.finish(PATIENCE);
     let segments = list(&folder).expect("readable");

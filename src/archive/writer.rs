@@ -22,9 +22,11 @@ const RETRY: Duration = Duration::from_secs(2);
 /// A segment has at most this share of the archive, and at most so many bytes: it goes as a whole.
 const SEGMENTS_MIN: u64 = 8;
 const SEGMENT_BYTES_MAX: u64 = 8 << 20;
-/// So much of the disk is left to others, who keep what matters more: this share, and at least so much.
+/// So much of the disk is left to others, who keep what matters more: this share, within these bounds.
+/// What they need does not grow with the disk, so a large disk that others fill is not full for the archive.
 const LEFT_SHARE: u64 = 10;
-const LEFT_BYTES: u64 = 24 << 20;
+const LEFT_BYTES_MIN: u64 = 24 << 20;
+const LEFT_BYTES_MAX: u64 = 256 << 20;
 /// A file takes at least a block of the disk.
 const BLOCK_BYTES: u64 = 4096;
 
@@ -69,7 +71,7 @@ fn ask_disk(folder: &Path) -> io::Result<Space> {
 
 impl Space {
     fn has_room_for(self, bytes: u64) -> bool {
-        self.free >= bytes + (self.all / LEFT_SHARE).max(LEFT_BYTES)
+        self.free >= bytes + (self.all / LEFT_SHARE).clamp(LEFT_BYTES_MIN, LEFT_BYTES_MAX)
     }
 }
 
