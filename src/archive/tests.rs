@@ -250,11 +250,6 @@ fn small_disk(folder: &Path) -> std::io::Result<Space> {
     Ok(Space { all: 64 * MIB, free: (64 * MIB).saturating_sub(used) })
 }
 
-/// A large disk that others have nearly filled.
-fn large_disk(_: &Path) -> std::io::Result<Space> {
-    Ok(Space { all: 252 << 30, free: 300 * MIB })
-}
-
 fn full_disk(folder: &Path) -> std::io::Result<Space> {
     small_disk(folder).map(|disk| Space { free: 20 * MIB, ..disk })
 }
@@ -280,7 +275,8 @@ fn it_leaves_room_on_a_disk_that_is_smaller_than_it_may_be() {
 #[test]
 fn a_large_disk_that_others_have_nearly_filled_takes_entries() {
     let folder = folder("large");
-    let archive = Archive::start_on(&folder, 64 * MIB, large_disk).expect("starts");
+    let disk = |_: &Path| Ok(Space { all: 252 << 30, free: 300 * MIB });
+    let archive = Archive::start_on(&folder, 64 * MIB, disk).expect("starts");
     write(&archive, (1..=5).map(|i| entry(i, 40)));
     assert!(!archive.condition().is_bad(), "{:?}", archive.condition());
     archive.finish(PATIENCE);
