@@ -6,10 +6,14 @@ mod common;
 use beltgauge::archive::Reader;
 use beltgauge::config::{Config, Site};
 use beltgauge::error::Result;
-use beltgauge::image::FrameTime;
+use beltgauge::image::{FrameTime, Plane};
+use beltgauge::kernel::Level;
+use beltgauge::plan::Plan;
 use beltgauge::run::{Appliance, demo};
 use beltgauge::source::synthetic::{Scenario, Synthetic};
 use beltgauge::source::{FrameSource, Pace, Paced};
+use beltgauge::stage::measure::Rounding;
+use beltgauge::stage::passes::Passes;
 use std::alloc::{GlobalAlloc, Layout, System};
 use std::io::{Read, Write};
 use std::net::{SocketAddr, TcpStream};
@@ -188,6 +192,42 @@ fn long_belt(width: usize, frames: u64) -> (Synthetic, Site) {
     (Synthetic::new(scenario).expect("renders"), site)
 }
 
+/// Measure whole passes of the demo's belt on a thread called vision; returns parcels and allocations.
+fn run_passes() -> (usize, u64) {
+    let (mut belt, site) = demo_belt();
+    VISION.store(0, Ordering::Relaxed);
+    let measure = move || {
+        let (view, zone, height_max_mm) = (site.view.clone(), site.config.zone, site.height_max_mm);
+        let (mut frames, mut pipeline) = beltgauge::run::build(site).expect("fits");
+        let mut plan = Plan::default();
+        Passes::plan(&view, &zone, height_max_mm, &mut plan);
+        let mut memory = plan.reserve(512).expect("fits");
+        let (rounding, level) = (Rounding::of_radius(0.0), Level::new());
+        let seen = pipeline.seen();
+        let mut passes =
+            Passes::new(&view, &zone, height_max_mm, rounding, level, seen, &mut memory)
+                .expect("planned");
+        let [width, height] = belt.size_px();
+        let mut parcels = 0;
+        for _ in 0..500 {
+            let Some(time) = belt.next_into(&mut frames[0]).expect("renders") else { break };
+            let raw = Plane::packed(&frames[0], width, height).expect("its size");
+            ARMED.store(true, Ordering::Relaxed);
+            pipeline.step(raw, time, &mut |_| ()).expect("its size");
+            let at = pipeline.belt_position();
+            passes.step(pipeline.pixels(), at, time, &mut |_| parcels += 1);
+            ARMED.store(false, Ordering::Relaxed);
+        }
+        ARMED.store(true, Ordering::Relaxed);
+        passes.finish(&mut |_| parcels += 1);
+        ARMED.store(false, Ordering::Relaxed);
+        parcels
+    };
+    let thread = std::thread::Builder::new().name("vision".into()).spawn(measure);
+    let parcels = thread.expect("a thread").join().expect("no panic");
+    (parcels, VISION.load(Ordering::Relaxed))
+}
+
 /// One test: the counters are the process's.
 #[test]
 fn ten_thousand_frames_with_parcels_allocate_nothing_and_memory_stays_as_it_was_planned() {
@@ -227,6 +267,9 @@ fn ten_thousand_frames_with_parcels_allocate_nothing_and_memory_stays_as_it_was_
     assert_eq!((capture, vision), (0, 0), "allocations with two workers and eight viewers");
     let pictures = PICTURES.load(Ordering::Relaxed);
     assert!(pictures >= 16, "the viewers got only {pictures} pictures: the test proves nothing");
+    let (parcels, vision) = run_passes();
+    assert!(parcels >= 5, "only {parcels} whole passes: the test proves nothing");
+    assert_eq!(vision, 0, "allocations by whole passes");
     // The counter counts: one allocation and one release a frame while armed.
     let (belt, site) = demo_belt();
     let mut leaking = Watched { leak: true, ..Watched::new(belt, 510) };

@@ -129,7 +129,9 @@ fn what_the_demo_records_is_measured_again_and_its_camera_calibrated() {
     assert!(output.status.success() && told.contains("frames recorded"), "{told}");
     let live = records(&out.join("parcels.jsonl"));
     assert!(live.len() >= 2, "{} parcels", live.len());
-    if !told.contains("missing") {
+    // What a slow computer left out of the pipeline is in the recording all the same.
+    let left_out = told.rsplit("dropped ").next().is_some_and(|count| !count.starts_with("0 "));
+    if !told.contains("missing") && !left_out {
         // The parcels that were inside at the end come after them. The configuration's camera has been
         // through text, which costs its last digits: a record's last digit, 0.01 mm, may be another.
         let again = measure(&folder, &[]);

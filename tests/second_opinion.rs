@@ -9,10 +9,9 @@ use beltgauge::plan::Plan;
 use beltgauge::run;
 use beltgauge::source::FrameSource;
 use beltgauge::source::synthetic::{Scenario, Synthetic};
-use beltgauge::stage::evidence::Evidence;
-use beltgauge::stage::measure::{Rounding, WholePass};
-use beltgauge::stage::parcels::{Face, Parcels};
-use beltgauge::stage::views::Views;
+use beltgauge::stage::measure::Rounding;
+use beltgauge::stage::parcels::Face;
+use beltgauge::stage::passes::Passes;
 
 /// Neighbours 12 mm apart, of other heights, and a flat envelope.
 const PARCELS: &str = r#"
@@ -58,7 +57,7 @@ const BORDER_MM: f64 = 28.0;
 /// What the second opinion saw of a belt.
 struct Seen {
     scenario: Scenario,
-    evidence: Evidence,
+    passes: Passes,
     faces: Vec<Face>,
     /// From belt-fixed X to the scenario's.
     offset_mm: f64,
@@ -77,53 +76,30 @@ fn look_at(parcels: &str, frames: u32) -> Seen {
     let (mut frames, mut pipeline) = run::build(site).expect("fits");
     let seen = pipeline.seen().to_vec();
     let mut plan = Plan::default();
-    Views::plan(&view, &mut plan);
-    Evidence::plan(&view, &zone, height_max_mm, &mut plan);
-    Parcels::plan(&view, &zone, height_max_mm, &mut plan);
+    Passes::plan(&view, &zone, height_max_mm, &mut plan);
     let (mut memory, level) = (plan.reserve(512).expect("fits"), Level::new());
-    let mut views = Views::new(&view, &zone, &mut memory).expect("planned");
-    let mut evidence =
-        Evidence::new(&view, &zone, height_max_mm, level, &seen, &mut memory).expect("planned");
-    let mut parcels =
-        Parcels::new(&view, &zone, &evidence, height_max_mm, level, &seen, &mut memory)
-            .expect("planned");
+    let rounding = Rounding::of_radius(0.0);
+    let mut passes = Passes::new(&view, &zone, height_max_mm, rounding, level, &seen, &mut memory)
+        .expect("planned");
     memory.seal().expect("all taken");
-    let pass = WholePass {
-        geometry: &view,
-        zone: &zone,
-        height_max_mm,
-        rounding: Rounding::of_radius(0.0),
-        seen: &seen,
-    };
-    let (mut faces, mut looked, mut offset_mm) = (Vec::new(), 0, 0.0);
+    let (mut faces, mut offset_mm) = (Vec::new(), 0.0);
     let mut source = Synthetic::new(scenario.clone()).expect("a belt");
     let frame = &mut frames[0];
     while let Some(time) = source.next_into(frame).expect("frames") {
         let raw = Plane::packed(frame, 1280, 800).expect("its size");
         pipeline.step(raw, time, &mut |_| ()).expect("measures");
         let at = pipeline.belt_position();
-        if views.offer(pipeline.pixels(), at, time) {
-            let place = views.newest().expect("just kept");
-            evidence.add(&views, place);
-            parcels.add(&views, place);
-        }
-        evidence.advance(&views, at.travel_mm, at.breaks);
-        if evidence.decided().end - looked >= 8 {
-            looked = evidence.decided().end;
-            let end_mm = zone.x_max_mm - at.travel_mm;
-            let fit = |face: &Face| pass.cuboid(&views, face);
-            faces.extend(parcels.passed(&evidence, &views, end_mm, fit));
-        }
+        passes.step(pipeline.pixels(), at, time, &mut |passed| faces.push(passed.face));
         offset_mm = scenario.travel_at_frame_mm(time.index) - at.travel_mm;
     }
-    let fit = |face: &Face| pass.cuboid(&views, face);
-    faces.extend(parcels.passed(&evidence, &views, f64::NEG_INFINITY, fit));
-    Seen { scenario, evidence, faces, offset_mm }
+    passes.finish(&mut |passed| faces.push(passed.face));
+    Seen { scenario, passes, faces, offset_mm }
 }
 
 #[test]
 fn cells_of_a_top_face_agree_on_its_height_and_its_border_is_found() {
-    let Seen { scenario, evidence, faces, offset_mm } = look_at(PARCELS, 170);
+    let Seen { scenario, passes, faces, offset_mm } = look_at(PARCELS, 170);
+    let evidence = passes.evidence();
     assert_eq!(faces.len(), scenario.parcels().len(), "{faces:?}");
     assert!(faces.iter().all(|face| face.is_cuboid), "{faces:?}");
     let decided = evidence.decided();
@@ -186,8 +162,8 @@ y_mm = -180.0
 material = "white"
 "#;
 
-/// What encloses a thing is known to a cell of 3.5 mm and to the dark line of its own shadow at each side.
-const ENCLOSED_MM: f64 = 14.0;
+/// What encloses a thing is known at each side to the dark line of its own shadow, 6 mm, and to a place of 2 mm.
+const ENCLOSED_MM: f64 = 16.0;
 
 #[test]
 fn a_tube_and_a_bag_are_enclosed() {

@@ -11,16 +11,14 @@ use crate::image::FrameTime;
 use crate::kernel::Level;
 use crate::pipeline::{Pipeline, doubts};
 use crate::plan::Plan;
-use crate::stage::evidence::Evidence;
-use crate::stage::measure::{self, Measured, Rounding, WholePass, canonical_estimate};
-use crate::stage::parcels::{Face, Parcels};
-use crate::stage::views::{Kept, Views};
+use crate::stage::measure::{self, Measured, Rounding, canonical_estimate};
+use crate::stage::parcels::Face;
+use crate::stage::passes::{Passed, Passes};
+use crate::stage::views::Kept;
 use image::{Rgb, RgbImage};
 use std::io::Write;
 use std::path::{Path, PathBuf};
 
-/// Columns of cells between two looks for parcels.
-const LOOK_COLUMNS: i64 = 8;
 /// Columns of the picture at most: an hour of belt is no picture.
 const PICTURE_COLUMNS_MAX: usize = 20_000;
 /// Pixels of a picture's cell.
@@ -29,14 +27,10 @@ const PICTURE_PX: u32 = 2;
 /// The second opinion.
 pub struct Explainer {
     folder: PathBuf,
-    views: Views,
-    evidence: Evidence,
-    parcels: Parcels,
-    looked: i64,
-    breaks: u32,
+    passes: Passes,
     /// As JSON: each record, and what it was decided from.
     records: Vec<serde_json::Value>,
-    /// Heights of the columns decided, and the first one's number.
+    /// Heights of the columns decided, and the next one's number.
     picture: Vec<Vec<Option<f32>>>,
     pictured: i64,
 }
@@ -48,87 +42,36 @@ impl Explainer {
             Error::failure(format!("cannot create the folder: {e}")).in_file(folder)
         })?;
         let site = pipeline.site();
-        let (view, zone) = (&site.view, &site.config.zone);
+        let (view, zone, height_max_mm) = (&site.view, &site.config.zone, site.height_max_mm);
         let mut plan = Plan::default();
-        Views::plan(view, &mut plan);
-        Evidence::plan(view, zone, site.height_max_mm, &mut plan);
-        Parcels::plan(view, zone, site.height_max_mm, &mut plan);
+        Passes::plan(view, zone, height_max_mm, &mut plan);
         let mib = plan.bytes().div_ceil(1 << 20);
         let mut memory = plan.reserve(mib)?;
-        let views = Views::new(view, zone, &mut memory)?;
-        let (height_max_mm, level, seen) = (site.height_max_mm, Level::new(), pipeline.seen());
-        let evidence = Evidence::new(view, zone, height_max_mm, level, seen, &mut memory)?;
-        let parcels = Parcels::new(view, zone, &evidence, height_max_mm, level, seen, &mut memory)?;
+        let rounding = Rounding::of_radius(site.config.measure.edge_radius_mm);
+        let (level, seen) = (Level::new(), pipeline.seen());
+        let passes = Passes::new(view, zone, height_max_mm, rounding, level, seen, &mut memory)?;
         memory.seal()?;
         let (folder, records, picture) = (folder.to_owned(), Vec::new(), Vec::new());
-        Ok(Self {
-            folder,
-            views,
-            evidence,
-            parcels,
-            // Columns begin anywhere.
-            looked: i64::MIN / 2,
-            breaks: 0,
-            records,
-            picture,
-            pictured: 0,
-        })
+        Ok(Self { folder, passes, records, picture, pictured: 0 })
     }
 
     /// A frame more, after the pipeline's step.
     pub fn frame(&mut self, pipeline: &Pipeline, time: FrameTime) {
-        let at = pipeline.belt_position();
-        if at.breaks != self.breaks {
-            // What was before has no place in what comes.
-            self.look(pipeline, f64::NEG_INFINITY);
-            self.breaks = at.breaks;
-        }
-        if self.views.offer(pipeline.pixels(), at, time)
-            && let Some(place) = self.views.newest()
-        {
-            self.evidence.add(&self.views, place);
-            self.parcels.add(&self.views, place);
-        }
-        self.evidence.advance(&self.views, at.travel_mm, at.breaks);
-        let decided = self.evidence.decided();
-        if !decided.is_empty() && decided.end - self.looked >= LOOK_COLUMNS {
-            self.look(pipeline, pipeline.site().config.zone.x_max_mm - at.travel_mm);
-        }
-    }
-
-    fn look(&mut self, pipeline: &Pipeline, end_mm: f64) {
-        self.looked = self.evidence.decided().end;
+        let Self { passes, records, .. } = self;
+        let mut emit =
+            |passed: &Passed| records.extend(told(pipeline.site(), passed, records.len()));
+        passes.step(pipeline.pixels(), pipeline.belt_position(), time, &mut emit);
         self.draw();
-        let pass = whole_pass(pipeline);
-        let fit = |face: &Face| pass.cuboid(&self.views, face);
-        for face in self.parcels.passed(&self.evidence, &self.views, end_mm, fit) {
-            self.record(pipeline.site(), &pass, &face);
-        }
-    }
-
-    fn record(&mut self, site: &Site, pass: &WholePass<'_>, face: &Face) {
-        let Some((measured, travel_sigma)) = pass.measure(&self.views, face) else { return };
-        let Some(place) = self.views.newest() else { return };
-        let mut record =
-            record_of(&measured, self.views.kept(place), self.records.len() as u32 + 1);
-        record.flags.set(doubts(site, &measured, travel_sigma), true);
-        let Ok(serde_json::Value::Object(mut told)) = serde_json::to_value(record.rounded()) else {
-            return;
-        };
-        let share = (1e3 * measured.estimate.edge_share).round() / 1e3;
-        told.insert("edge_share".into(), share.into());
-        told.insert("edges".into(), measured.estimate.edge_count.into());
-        told.insert("face".into(), told_of(face));
-        self.records.push(told.into());
     }
 
     fn draw(&mut self) {
-        let decided = self.evidence.decided();
+        let evidence = self.passes.evidence();
+        let decided = evidence.decided();
         if self.picture.is_empty() {
             self.pictured = decided.start;
         }
         for column in self.pictured.max(decided.start)..decided.end {
-            let cells = self.evidence.column(column).iter();
+            let cells = evidence.column(column).iter();
             let heights = cells.map(|cell| (cell.strength > 0.0).then_some(cell.height_mm));
             if self.picture.len() < PICTURE_COLUMNS_MAX {
                 self.picture.push(heights.collect());
@@ -139,7 +82,8 @@ impl Explainer {
 
     /// The end of the recording: what is left, and the files.
     pub fn finish(mut self, pipeline: &Pipeline) -> Result<()> {
-        self.look(pipeline, f64::NEG_INFINITY);
+        let Self { passes, records, .. } = &mut self;
+        passes.finish(&mut |passed| records.extend(told(pipeline.site(), passed, records.len())));
         let path = self.folder.join("parcels.jsonl");
         let io = |e: std::io::Error| Error::failure(format!("cannot write: {e}")).in_file(&path);
         let mut file = std::fs::File::create(&path).map_err(io)?;
@@ -155,15 +99,17 @@ impl Explainer {
     }
 }
 
-fn whole_pass(pipeline: &Pipeline) -> WholePass<'_> {
-    let site = pipeline.site();
-    WholePass {
-        geometry: &site.view,
-        zone: &site.config.zone,
-        height_max_mm: site.height_max_mm,
-        rounding: Rounding::of_radius(site.config.measure.edge_radius_mm),
-        seen: pipeline.seen(),
-    }
+/// A parcel's record, and what it was decided from.
+fn told(site: &Site, passed: &Passed, before: usize) -> Option<serde_json::Value> {
+    let Passed { face, measured, travel_sigma, newest } = passed;
+    let mut record = record_of(measured, *newest, before as u32 + 1);
+    record.flags.set(doubts(site, measured, *travel_sigma), true);
+    let mut told = serde_json::to_value(record.rounded()).ok()?;
+    let share = (1e3 * measured.estimate.edge_share).round() / 1e3;
+    told["edge_share"] = share.into();
+    told["edges"] = measured.estimate.edge_count.into();
+    told["face"] = told_of(face);
+    Some(told)
 }
 
 /// What the evidence showed of a top face, before edges were fitted.

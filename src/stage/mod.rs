@@ -5,6 +5,7 @@ pub mod evidence;
 pub mod measure;
 pub mod odometry;
 pub mod parcels;
+pub mod passes;
 pub mod rectify;
 pub mod riders;
 pub mod segment;

@@ -1,4 +1,5 @@
 //! The slow part of a picture: a mean over neighbours.
+#![expect(clippy::inline_always, reason = "only inlined code is compiled for its level")]
 
 /// Neighbours to either side.
 pub const REACH: usize = 2;
@@ -6,6 +7,7 @@ const WIDTH: usize = 2 * REACH + 1;
 
 /// Mean over a square of [`REACH`] neighbours to either side, in place; `scratch` is as large. The borders
 /// keep their values along the side that ends there. NaN spreads to its neighbours alone.
+#[inline(always)]
 pub fn box_filter(values: &mut [f32], scratch: &mut [f32], width: usize) {
     let height = values.len() / width;
     if width < WIDTH || height < WIDTH {
@@ -22,6 +24,7 @@ pub fn box_filter(values: &mut [f32], scratch: &mut [f32], width: usize) {
     mean(std::array::from_fn(|d| &scratch[d * width..]), &mut values[REACH * width..last]);
 }
 
+#[inline(always)]
 fn mean(neighbours: [&[f32]; WIDTH], out: &mut [f32]) {
     let [a, b, c, d, e] = neighbours.map(|line| &line[..out.len()]);
     for (i, out) in out.iter_mut().enumerate() {

@@ -9,4 +9,5 @@ pub mod profile;
 pub mod remap;
 pub mod runs;
 pub mod semblance;
+pub mod steps;
 pub mod texture;

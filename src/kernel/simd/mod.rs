@@ -5,10 +5,12 @@
 //! The `scalar` kernel of the same name is the specification: the same bits, at every level.
 #![expect(clippy::inline_always, reason = "only inlined code is compiled for its level")]
 
+pub mod box_filter;
 pub mod corners;
 pub mod mixture;
 pub mod remap;
 pub mod semblance;
+pub mod steps;
 pub mod texture;
 
 /// Run a test at every level that this processor has.

@@ -7,8 +7,10 @@
 use crate::camera::BeltView;
 use crate::error::Result;
 use crate::image::Plane;
+use crate::kernel::Level;
 use crate::kernel::scalar::bits::{self, words};
-use crate::kernel::scalar::box_filter::{REACH, box_filter};
+use crate::kernel::scalar::box_filter::REACH;
+use crate::kernel::simd::box_filter::box_filter;
 use crate::plan::{Block, Memory, Plan};
 use crate::stage::views::VIEWS_MAX;
 
@@ -27,6 +29,7 @@ pub struct Cells {
     pub cell_px: usize,
     /// Cells along and across the view.
     pub size: [usize; 2],
+    level: Level,
     /// Whether the camera sees a cell with its surroundings: 0 or 1.
     seen: Block<u8>,
     /// Logarithms of the mean, by the sum of a cell's grey values.
@@ -68,7 +71,7 @@ impl Cells {
     }
 
     /// Nothing seen yet. `seen`: bit mask of the view's pixels that the camera sees.
-    pub fn new(view: &BeltView, seen: &[u64], memory: &mut Memory) -> Result<Self> {
+    pub fn new(view: &BeltView, level: Level, seen: &[u64], memory: &mut Memory) -> Result<Self> {
         let (cell_px, size) = size_of(view);
         let [columns, rows] = size;
         let n = words(view.size_px[0]);
@@ -99,6 +102,7 @@ impl Cells {
         Ok(Self {
             cell_px,
             size,
+            level,
             seen: seen_cells,
             log_of_sum,
             log: memory.take("evidence.log", 0.0)?,
@@ -124,7 +128,7 @@ impl Cells {
         }
         self.slow.copy_from_slice(&self.log);
         for _ in 0..2 {
-            box_filter(&mut self.slow, &mut self.scratch, rows);
+            box_filter(self.level, &mut self.slow, &mut self.scratch, rows);
         }
         let values = &mut self.values[place * columns * rows..][..columns * rows];
         let fine = self.log.iter().zip(&*self.slow).map(|(log, slow)| log - slow);

@@ -116,6 +116,12 @@ impl Evidence {
         Sizes { rows, view_rows: cells::rows(view), planes, columns }
     }
 
+    /// Cells of the whole scroll.
+    pub fn cells_max(view: &BeltView, zone: &BeltRect, height_max_mm: f64) -> usize {
+        let Sizes { rows, columns, .. } = Self::sizes(view, zone, height_max_mm);
+        rows * columns
+    }
+
     /// Memory for a site.
     pub fn plan(view: &BeltView, zone: &BeltRect, height_max_mm: f64, plan: &mut Plan) {
         Cells::plan(view, plan);
@@ -142,7 +148,7 @@ impl Evidence {
     ) -> Result<Self> {
         let Sizes { rows, columns, .. } = Self::sizes(view, zone, height_max_mm);
         let cell_mm = Self::cell_mm(view);
-        let cells = Cells::new(view, seen, memory)?;
+        let cells = Cells::new(view, level, seen, memory)?;
         let mut planes = memory.take("evidence.planes", [0.0; 2])?;
         let (_, step) = planes_of(view, zone, height_max_mm, cell_mm);
         for (k, plane) in planes.iter_mut().enumerate() {

@@ -7,8 +7,11 @@ use super::observe::{Frame, PassView};
 use super::{BOX_EDGE_SHARE_MIN, EDGE_COUNT_MIN, Measured};
 use crate::belt::BeltPosition;
 use crate::camera::BeltView;
+use crate::error::Result;
+use crate::kernel::scalar::bits::words;
+use crate::plan::{Block, Memory, Plan};
 use crate::stage::parcels::{Cuboid, Face, Rectangle};
-use crate::stage::views::Views;
+use crate::stage::views::{VIEWS_MAX, Views};
 use crate::units::BeltRect;
 
 /// A face's height from the evidence is good to this, mm.
@@ -23,33 +26,58 @@ const HEIGHT_MIN_MM: f64 = 2.4;
 const LINE_MM: f64 = 6.0;
 /// Times that the profiles are taken anew, where the last fit has the edges.
 const ROUNDS: usize = 3;
+/// Of a border that may be another one's part, until it is seen to explain more; and of a cuboid that was fitted
+/// before its pass was whole.
+const ROUNDS_AGAIN: usize = 2;
+const ROUNDS_RIVAL: usize = 1;
 
-/// What does not change from parcel to parcel.
-pub struct WholePass<'a> {
-    /// Belt view geometry.
-    pub geometry: &'a BeltView,
-    /// The measuring zone.
-    pub zone: &'a BeltRect,
-    /// Upper bound of the height.
-    pub height_max_mm: f64,
-    /// What the edges' radius does to them.
-    pub rounding: Rounding,
+/// The fit, and its memory.
+pub struct WholePass {
+    geometry: BeltView,
+    zone: BeltRect,
+    height_max_mm: f64,
+    rounding: Rounding,
     /// Bit mask of the view's pixels that the camera sees.
-    pub seen: &'a [u64],
+    seen: Block<u64>,
+    /// Profiles in the views of one pass.
+    pass: Block<PassView>,
 }
 
-impl WholePass<'_> {
+impl WholePass {
+    /// Memory for a view.
+    pub fn plan(view: &BeltView, plan: &mut Plan) {
+        let mask = words(view.size_px[0]) * view.size_px[1];
+        plan.add::<u64>("whole_pass.seen", mask, "bit: the camera sees it");
+        plan.add::<PassView>("whole_pass.pass", VIEWS_MAX, "profiles in the views of one pass");
+    }
+
+    /// For a site. `seen`: bit mask of the view's pixels that the camera sees.
+    pub fn new(
+        view: &BeltView,
+        zone: &BeltRect,
+        height_max_mm: f64,
+        rounding: Rounding,
+        seen: &[u64],
+        memory: &mut Memory,
+    ) -> Result<Self> {
+        let mut mask = memory.take("whole_pass.seen", 0)?;
+        mask.copy_from_slice(seen);
+        let pass = memory.take("whole_pass.pass", PassView::EMPTY)?;
+        let (geometry, zone) = (view.clone(), *zone);
+        Ok(Self { geometry, zone, height_max_mm, rounding, seen: mask, pass })
+    }
+
     /// Measure the parcel of a face from the views of its pass; X holds at the newest view's belt position. With it the
     /// relative standard uncertainty of the belt's travel over the pass. What has no cuboid's edges is as large as the
     /// face found of it.
-    pub fn measure(&self, views: &Views, face: &Face) -> Option<(Measured, f64)> {
+    pub fn measure(&mut self, views: &Views, face: &Face) -> Option<(Measured, f64)> {
         let fitted = if face.is_cuboid { self.fit(views, face) } else { None };
         fitted.filter(|(measured, _)| measured.is_box).or_else(|| self.enclose(views, face))
     }
 
     /// The cuboid that the edges around a face show, if it lies over the belt.
-    pub fn cuboid(&self, views: &Views, face: &Face) -> Option<Cuboid> {
-        let (measured, _) = self.fit_border(views, &face.rectangle, face.height_mm)?;
+    pub fn cuboid(&mut self, views: &Views, face: &Face) -> Option<Cuboid> {
+        let (measured, _) = self.fit_border(views, &face.rectangle, face.height_mm, ROUNDS)?;
         let p = &measured.estimate.params;
         let rectangle = Rectangle {
             x_mm: p[X] - views.kept(views.newest()?).at.travel_mm,
@@ -63,18 +91,20 @@ impl WholePass<'_> {
     }
 
     /// Fit a cuboid. Of the borders that may be the face's, that one which most edges confirm.
-    fn fit(&self, views: &Views, face: &Face) -> Option<(Measured, f64)> {
-        let narrower = face.narrower.iter().flatten();
-        let borders = std::iter::once(&face.rectangle).chain(narrower);
-        let fits = borders.filter_map(|border| self.fit_border(views, border, face.height_mm));
-        fits.reduce(|outer, inner| {
-            let share = |(measured, _): &(Measured, f64)| measured.estimate.edge_share;
-            let better = share(&inner) > share(&outer) + CLEARLY_BETTER;
-            if better { inner } else { outer }
-        })
+    fn fit(&mut self, views: &Views, face: &Face) -> Option<(Measured, f64)> {
+        let share = |(measured, _): &(Measured, f64)| measured.estimate.edge_share;
+        let mut fit = |border, rounds| self.fit_border(views, border, face.height_mm, rounds);
+        let mut best = fit(&face.rectangle, ROUNDS_AGAIN);
+        for border in face.narrower.iter().flatten() {
+            let least = best.as_ref().map_or(0.0, |best| share(best) + CLEARLY_BETTER);
+            let is_rival = fit(border, ROUNDS_RIVAL).is_some_and(|fitted| share(&fitted) > least);
+            let rival = if is_rival { fit(border, ROUNDS) } else { None };
+            best = rival.filter(|rival| share(rival) > least).or(best);
+        }
+        best
     }
 
-    fn enclose(&self, views: &Views, face: &Face) -> Option<(Measured, f64)> {
+    fn enclose(&mut self, views: &Views, face: &Face) -> Option<(Measured, f64)> {
         let newest = views.kept(views.newest()?).at;
         let params = Self::params_of(&face.rectangle, face.height_mm, newest.travel_mm);
         let (_, first) = self.look(views, &params, newest.travel_mm);
@@ -109,18 +139,21 @@ impl WholePass<'_> {
     }
 
     fn fit_border(
-        &self,
+        &mut self,
         views: &Views,
         border: &Rectangle,
         height_mm: f64,
+        rounds: usize,
     ) -> Option<(Measured, f64)> {
         let newest = views.kept(views.newest()?).at;
         let mut params = Self::params_of(border, height_mm, newest.travel_mm);
         let m = self.geometry.magnification(height_mm);
         let sigma = m * m / self.geometry.camera_height_mm * FACE_HEIGHT_SIGMA_MM;
+        let geometry = self.geometry.clone();
+        let zone = self.zone;
         let mut problem = Problem {
-            geometry: self.geometry,
-            zone: self.zone,
+            geometry: &geometry,
+            zone: &zone,
             height_max_mm: self.height_max_mm,
             rounding: self.rounding,
             reference_travel_mm: newest.travel_mm,
@@ -131,13 +164,14 @@ impl WholePass<'_> {
             view_stride: 1,
         };
         let mut best: Option<Estimate> = None;
-        for round in 0..ROUNDS {
-            let (pass, first) = self.look(views, &params, newest.travel_mm);
+        for round in 0..rounds {
+            let (count, first) = self.look(views, &params, newest.travel_mm);
+            let pass = &self.pass[..count];
             problem.travel_sigma = newest.sigma_since(&first?);
             let fitted = if round == 0 {
-                problem.refine_edges(&pass, params, &GATES_PX)
+                problem.refine_edges(pass, params, &GATES_PX)
             } else {
-                problem.fit_edges(&pass, params)
+                problem.fit_edges(pass, params)
             };
             let Some(fitted) = fitted else { break };
             params = fitted.params;
@@ -159,34 +193,34 @@ impl WholePass<'_> {
         Some((Measured { estimate, is_box, has_edges, disputed }, problem.travel_sigma))
     }
 
-    /// Profiles across a cuboid's edges in every view that has any of it in the zone, and where the belt was in
-    /// the first of them.
+    /// Take profiles across a cuboid's edges in every view that has any of it in the zone. Returns how many these are,
+    /// and where the belt was in the first of them.
     fn look(
-        &self,
+        &mut self,
         views: &Views,
         params: &Params,
         reference_travel_mm: f64,
-    ) -> (Vec<PassView>, Option<BeltPosition>) {
-        let mut pass: Vec<PassView> = Vec::new();
-        let mut first = None;
+    ) -> (usize, Option<BeltPosition>) {
+        let (mut count, mut first) = (0, None);
         for place in views.places() {
             let travel_mm = views.kept(place).at.travel_mm;
-            let outline = Outline::new(self.geometry, params, travel_mm - reference_travel_mm);
+            let outline = Outline::new(&self.geometry, params, travel_mm - reference_travel_mm);
             let frame = Frame {
-                view: self.geometry,
-                zone: self.zone,
+                view: &self.geometry,
+                zone: &self.zone,
                 grey: views.grey(place),
-                seen: self.seen,
+                seen: &self.seen,
                 dark: &[],
             };
-            let mut view = PassView::EMPTY;
+            let view = &mut self.pass[count];
+            *view = PassView::EMPTY;
             view.travel_mm = travel_mm;
-            frame.sample_edges(&outline, &mut view);
+            frame.sample_edges(&outline, view);
             if !view.samples().is_empty() {
-                pass.push(view);
+                count += 1;
                 first = Some(views.kept(place).at);
             }
         }
-        (pass, first)
+        (count, first)
     }
 }

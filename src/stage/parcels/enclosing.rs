@@ -10,7 +10,7 @@ use super::stack::EdgePixel;
 /// Directions tried over a quarter turn.
 const DIRECTIONS: usize = 90;
 /// Cells at each end that may lie outside: a few scatter.
-const OUTSIDE_SHARE: f32 = 0.005;
+const OUTSIDE_SHARE: f64 = 0.005;
 /// An edge spreads cells by four: 16 mm with half a cell. It is sought as far, and a little more, mm.
 pub const REACH_MM: f64 = 18.0;
 /// Where no edge is found it is there, mm inside.
@@ -24,20 +24,28 @@ const BESIDE_STRENGTH_MAX: f64 = 0.5;
 /// Width of a place where a side may be, mm.
 const PLACE_MM: f64 = 2.0;
 const PLACES: usize = (2.0 * REACH_MM / PLACE_MM) as usize;
+/// Steps along a side that are looked at, at most.
+const STEPS_MAX: usize = 512;
 /// What belongs to a side lies so far inside of the cells' border, mm.
 const SIDE_DEPTH_MM: f64 = 30.0;
 
-/// The rectangle of the smallest area around points (X less the belt's travel, Y, mm).
-pub fn smallest_rectangle(points: &[[f64; 2]]) -> Rectangle {
-    let mut scratch = Vec::new();
+/// The rectangle of the smallest area around points (X less the belt's travel, Y, mm). `scratch` has room for as many
+/// values.
+pub fn smallest_rectangle(
+    points: &(impl Iterator<Item = [f64; 2]> + Clone),
+    scratch: &mut [f64],
+) -> Rectangle {
     let mut best: Option<(f64, Rectangle)> = None;
     for direction in 0..DIRECTIONS {
         let yaw = (direction as f64 * 90.0 / DIRECTIONS as f64).to_radians();
         let (sin, cos) = yaw.sin_cos();
         let [u, v] = [[cos, sin], [-sin, cos]].map(|[a, b]| {
-            scratch.clear();
-            scratch.extend(points.iter().map(|[x, y]| (a * x + b * y) as f32));
-            extent(&mut scratch)
+            let mut count = 0;
+            for ([x, y], value) in points.clone().zip(&mut *scratch) {
+                *value = a * x + b * y;
+                count += 1;
+            }
+            extent(&mut scratch[..count])
         });
         let rectangle = Rectangle {
             x_mm: 0.5 * (cos * (u[0] + u[1]) - sin * (v[0] + v[1])),
@@ -56,11 +64,10 @@ pub fn smallest_rectangle(points: &[[f64; 2]]) -> Rectangle {
 }
 
 /// Lowest and highest, but for a few.
-fn extent(values: &mut [f32]) -> [f64; 2] {
+fn extent(values: &mut [f64]) -> [f64; 2] {
     let Some(last) = values.len().checked_sub(1) else { return [0.0; 2] };
-    let outside = (OUTSIDE_SHARE * last as f32) as usize;
-    [outside, last - outside]
-        .map(|place| f64::from(*values.select_nth_unstable_by(place, f32::total_cmp).1))
+    let outside = (OUTSIDE_SHARE * last as f64) as usize;
+    [outside, last - outside].map(|place| *values.select_nth_unstable_by(place, f64::total_cmp).1)
 }
 
 /// A side of a rectangle: front, back, left or right seen along the yaw.
@@ -102,13 +109,15 @@ impl<'a> Side<'a> {
     }
 
     /// Share of the side along which cells lie, each `cell_mm` wide.
-    pub fn covered(&self, points: &[[f64; 2]], cell_mm: f64) -> f64 {
-        let count = (self.length_mm / cell_mm).ceil().max(1.0) as usize;
-        let mut covered = vec![false; count];
-        for &[x_mm, y_mm] in points {
+    pub fn covered(&self, points: impl Iterator<Item = [f64; 2]>, cell_mm: f64) -> f64 {
+        // A longer side is looked at in wider steps.
+        let count = ((self.length_mm / cell_mm).ceil().max(1.0) as usize).min(STEPS_MAX);
+        let step_mm = self.length_mm / count as f64;
+        let mut covered = [false; STEPS_MAX];
+        for [x_mm, y_mm] in points {
             let [depth_mm, place_mm] = self.depth_and_place_mm(x_mm, y_mm);
             if depth_mm < SIDE_DEPTH_MM {
-                let place = ((place_mm + 0.5 * self.length_mm) / cell_mm).max(0.0) as usize;
+                let place = ((place_mm + 0.5 * self.length_mm) / step_mm).max(0.0) as usize;
                 covered[place.min(count - 1)] = true;
             }
         }
@@ -161,7 +170,7 @@ mod tests {
     fn the_smallest_rectangle_around_a_turned_one_is_itself_and_a_few_strays_change_nothing() {
         let mut points = points();
         points.extend([[500.0, 300.0], [700.0, -20.0]]);
-        let found = smallest_rectangle(&points);
+        let found = smallest_rectangle(&points.iter().copied(), &mut vec![0.0; points.len()]);
         let near = |value: f64, truth: f64| assert!((value - truth).abs() < 2.0, "{found:?}");
         near(found.yaw.to_degrees(), 30.0);
         near(found.length_mm, 200.0);
@@ -193,7 +202,7 @@ mod tests {
         let rectangle = Rectangle { length_mm: 200.0, width_mm: 80.0, ..Rectangle::default() };
         let half: Vec<[f64; 2]> = (0..20).map(|k| [95.0, 2.0 * f64::from(k)]).collect();
         let [front, back, ..] = Side::all(&rectangle);
-        assert!((front.covered(&half, 2.0) - 0.5).abs() < 0.03);
-        assert!(back.covered(&half, 2.0) < 1e-9);
+        assert!((front.covered(half.iter().copied(), 2.0) - 0.5).abs() < 0.03);
+        assert!(back.covered(half.iter().copied(), 2.0) < 1e-9);
     }
 }

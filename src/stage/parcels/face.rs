@@ -1,5 +1,6 @@
 //! What a parcel shows from above, and how two such things exclude each other.
 
+use super::enclosing::SPREAD_MM;
 use super::rectangle::Rectangle;
 use crate::stage::evidence::Cell;
 
@@ -9,13 +10,15 @@ const SUPPORT_MIN: f64 = 0.65;
 const SIDE_SUPPORT_MIN: f64 = 0.25;
 /// Lines that happen to lie right give this share.
 const ACCIDENT_SUPPORT: f64 = 0.55;
-/// Cells this far around a face are its own: its sides, mm.
-const SIDE_MM: f64 = 10.0;
+/// Cells this far around a face are its own: its sides, as far as an edge spreads, mm.
+const SIDE_MM: f64 = SPREAD_MM;
 /// What encloses a bag is known to a few mm: two such faces are one parcel's when this share of one lies
 /// inside the other.
 const OVERLAP_SHARE: f64 = 0.3;
 /// Two cuboids that reach further into each other are one parcel's, mm.
 const CUBOID_DEPTH_MM: f64 = 5.0;
+/// Two borders are one when so much of each lies inside the other.
+const SAME_SHARE: f64 = 0.95;
 /// What differs less in height is at one height, mm.
 pub const STEP_MM: f64 = 12.0;
 
@@ -56,6 +59,13 @@ impl Face {
     pub fn owns(&self, cell: &Cell, [x_mm, y_mm]: [f64; 2]) -> bool {
         f64::from(cell.height_mm) < self.height_mm + STEP_MM
             && self.rectangle.outside_mm(x_mm, y_mm) < SIDE_MM
+    }
+
+    /// Whether two faces have one border at one height.
+    pub fn is_same(&self, other: &Self) -> bool {
+        let [one, two] = [&self.rectangle, &other.rectangle];
+        (self.height_mm - other.height_mm).abs() < STEP_MM
+            && one.share_inside(two).min(two.share_inside(one)) > SAME_SHARE
     }
 
     /// Whether two faces cannot be two parcels'.

@@ -7,8 +7,10 @@
 //! one: where they are higher than its top, it is the outline of a bag or a stack; where they lie on the belt, it
 //! is nothing. What is raised and belongs to no face, as a tube, is enclosed as it is.
 
+mod content;
 mod enclosing;
 mod face;
+mod groups;
 mod rectangle;
 mod scroll;
 mod stack;
@@ -22,10 +24,12 @@ use crate::error::Result;
 use crate::kernel::Level;
 use crate::plan::{Memory, Plan};
 use crate::units::BeltRect;
+use content::{Content, HIGHEST_SHARE};
 use enclosing::Side;
 use face::is_border;
+use groups::Group;
 use rectangle::{CROP_MM, GRID_MM, RectangleSearch};
-use scroll::{CELLS_MIN, Content, HEIGHT_MIN_MM, HIGHEST_SHARE, Scroll};
+use scroll::{HEIGHT_MIN_MM, Scroll};
 use stack::{Stack, WINDOW_MAX_MM, Window};
 use steps::{Scale, Steps};
 use still::Still;
@@ -35,14 +39,18 @@ pub use rectangle::Rectangle;
 
 /// What is looked at around a beginning, mm.
 const REACH_MM: f64 = 420.0;
-/// Where the plane of the sharpest border is sought around the cells' height, mm, coarse and fine.
-const HEIGHT_OFFSETS_MM: [&[f64]; 2] = [&[-5.0, 5.0, -10.0, 10.0, -15.0, 15.0], &[-2.5, 2.5]];
+/// The plane of the sharpest border is sought in such steps from the cells' height, mm, ...
+const HEIGHT_STEPS_MM: [f64; 2] = [5.0, 2.5];
+/// ... each at most so often.
+const HEIGHT_STEPS_MAX: u32 = 3;
 /// Times that the border is sought anew on the plane where it was sharpest.
 const LOOKS: usize = 2;
 /// Rectangles found in coarse pictures that are looked at in fine ones: a beginning's two best directions.
 const CANDIDATES: usize = 2;
 /// What is looked at around a known border, mm.
 const NEAR_MM: f64 = 40.0;
+/// Parcels on the way to the zone's end, and behind it, at most: more are counted.
+const FACES_MAX: usize = 64;
 /// What no face explains is a thing if it is wider than this, mm: an edge alone spreads cells over 32 mm.
 const SIDE_MIN_MM: f64 = 40.0;
 
@@ -68,7 +76,7 @@ impl Layer {
         seen: &[u64],
         memory: &mut Memory,
     ) -> Result<Self> {
-        let steps = Steps::new(view, scale, seen, memory)?;
+        let steps = Steps::new(view, scale, level, seen, memory)?;
         let still = Still::new(view, scale, memory)?;
         Ok(Self { steps, still, stack: Stack::new(view, scale, zone, level, memory)? })
     }
@@ -93,14 +101,17 @@ pub struct Parcels {
     coarse: Layer,
     search: RectangleSearch,
     /// Found, not yet passed on.
-    waiting: Vec<Face>,
+    waiting: heapless::Vec<Face, FACES_MAX>,
     /// Passed on; their cells may still come.
-    gone: Vec<Face>,
+    gone: heapless::Vec<Face, FACES_MAX>,
+    /// Those for which there was no room.
+    overflows: u64,
 }
 
 impl Parcels {
     /// Memory for a site.
     pub fn plan(view: &BeltView, zone: &BeltRect, height_max_mm: f64, plan: &mut Plan) {
+        Scroll::plan(Evidence::cells_max(view, zone, height_max_mm), plan);
         Layer::plan(view, Scale::Fine, zone, height_max_mm, plan);
         Layer::plan(view, Scale::Coarse, zone, height_max_mm, plan);
         RectangleSearch::plan(zone, plan);
@@ -117,13 +128,14 @@ impl Parcels {
         memory: &mut Memory,
     ) -> Result<Self> {
         Ok(Self {
-            scroll: Scroll::new(evidence, height_max_mm),
+            scroll: Scroll::new(evidence, height_max_mm, memory)?,
             height_max_mm,
             fine: Layer::new(view, Scale::Fine, zone, level, seen, memory)?,
             coarse: Layer::new(view, Scale::Coarse, zone, level, seen, memory)?,
             search: RectangleSearch::new(memory)?,
-            waiting: Vec::new(),
-            gone: Vec::new(),
+            waiting: heapless::Vec::new(),
+            gone: heapless::Vec::new(),
+            overflows: 0,
         })
     }
 
@@ -133,48 +145,70 @@ impl Parcels {
         self.coarse.add(views, place);
     }
 
-    /// The parcels whose trailing end has passed `end_mm`, X less the belt's travel. `fit`: the cuboid
-    /// that the edges around a face show, if it lies over the belt.
-    pub fn passed(
-        &mut self,
-        evidence: &Evidence,
-        views: &Views,
-        end_mm: f64,
-        fit: impl Fn(&Face) -> Option<Cuboid>,
-    ) -> Vec<Face> {
+    /// Parcels that were found and for which there was no room.
+    pub fn overflows(&self) -> u64 {
+        self.overflows
+    }
+
+    /// Take over what is decided of the scroll.
+    pub fn take_columns(&mut self, evidence: &Evidence) {
         self.scroll.take_columns(evidence, self.waiting.iter().chain(&self.gone));
         let first_mm = self.scroll.first_mm();
         self.gone.retain(|face| face.rectangle.trailing_mm() < first_mm);
-        for (members, height_mm) in self.scroll.beginnings(end_mm == f64::NEG_INFINITY) {
-            let members = self.scroll.free_of(members);
-            if members.len() < CELLS_MIN {
-                continue;
-            }
-            let found = self.face(&members, height_mm, views);
-            self.scroll.take(&members);
-            if let Some(face) = found.and_then(|found| self.parcel(views, &found, &fit)) {
-                self.scroll.claim(&face);
-                self.keep(&face);
-            }
+    }
+
+    /// Look at what most cells begin (of all, once the belt has `ended`). Returns whether there was anything. `fit`: the
+    /// cuboid that the edges around a face show, if it lies over the belt.
+    pub fn look(
+        &mut self,
+        views: &Views,
+        ended: bool,
+        fit: impl FnMut(&Face) -> Option<Cuboid>,
+    ) -> bool {
+        let Some(group) = self.scroll.look_at_beginning(ended) else { return false };
+        self.scroll.take();
+        let fresh = self.face(&group, views).filter(|found| !self.is_known(found));
+        if let Some(face) = fresh.and_then(|fresh| self.parcel(views, &fresh, fit)) {
+            self.scroll.claim(&face);
+            self.keep(&face);
         }
-        let has_passed = |face: &mut Face| face.rectangle.trailing_mm() > end_mm;
-        let mut passed: Vec<Face> = self.waiting.extract_if(.., has_passed).collect();
-        let known = self.waiting.iter().chain(&self.gone).chain(&passed);
-        for members in self.scroll.left_over(&known, end_mm) {
-            passed.extend(self.enclose(views, &members));
+        true
+    }
+
+    /// The next parcel whose trailing end has passed `end_mm`, X less the belt's travel.
+    pub fn next_passed(&mut self, end_mm: f64) -> Option<Face> {
+        let has_passed = |face: &Face| face.rectangle.trailing_mm() > end_mm;
+        let place = self.waiting.iter().position(has_passed)?;
+        let face = self.waiting.remove(place);
+        self.let_go(&face);
+        Some(face)
+    }
+
+    /// The next thing that has passed `end_mm` and that no face explains.
+    pub fn next_left_over(&mut self, views: &Views, end_mm: f64) -> Option<Face> {
+        loop {
+            let known = self.waiting.iter().chain(&self.gone);
+            let group = self.scroll.look_at_left_over(&known, end_mm)?;
+            if let Some(face) = self.enclose(views, &group) {
+                self.let_go(&face);
+                return Some(face);
+            }
+            self.scroll.settle();
         }
-        self.gone.extend(&passed);
-        passed
+    }
+
+    /// A parcel was passed on: what comes of its cells is known.
+    fn let_go(&mut self, face: &Face) {
+        if self.gone.is_full() {
+            self.gone.remove(0);
+        }
+        // There is room.
+        let _ = self.gone.push(*face);
     }
 
     /// The face that a beginning belongs to.
-    fn face(&mut self, members: &[usize], height_mm: f64, views: &Views) -> Option<Face> {
-        let places = [0, 1]
-            .map(|k| -> Vec<f64> { members.iter().map(|&i| self.scroll.place_mm(i)[k]).collect() });
-        let around = places.each_ref().map(|mm| {
-            mm.iter().fold([f64::INFINITY, f64::NEG_INFINITY], |[a, b], v| [a.min(*v), b.max(*v)])
-        });
-        let inside = places.map(|mut mm| place_of(&mut mm, 0.5));
+    fn face(&mut self, group: &Group, views: &Views) -> Option<Face> {
+        let Group { cells, around_mm: around, inside_mm: inside, height_mm } = *group;
         let mut best = self.rectangle(views, height_mm, around, inside)?;
         let mut top_mm = height_mm;
         for _ in 0..LOOKS {
@@ -186,7 +220,7 @@ impl Parcels {
                 None => break,
             }
         }
-        is_border(&best).then(|| self.with_rivals(views, best, top_mm, members.len()))
+        is_border(&best).then(|| self.with_rivals(views, best, top_mm, cells))
     }
 
     /// A face with the borders further inside that may be its own, too.
@@ -202,25 +236,37 @@ impl Parcels {
         Face { rectangle, narrower, height_mm, cells, is_cuboid: false }
     }
 
-    /// The plane on which a border is sharpest, and the border there.
+    /// The plane on which a border is sharpest, and the border there: uphill, in steps of half the last size.
     fn sharpest(&mut self, views: &Views, border: Rectangle, height_mm: f64) -> (Rectangle, f64) {
         let (mut best, mut top_mm) = (border, height_mm);
-        for offsets_mm in HEIGHT_OFFSETS_MM {
-            let from_mm = top_mm;
-            for offset_mm in offsets_mm {
-                let trial_mm = from_mm + offset_mm;
-                if !(f64::from(HEIGHT_MIN_MM)..self.height_max_mm).contains(&trial_mm) {
-                    continue;
-                }
-                self.fine.fill(views, trial_mm, border_of(&best, NEAR_MM));
-                let middle = [best.x_mm as f32, best.y_mm as f32];
-                let found = self.search.near(&self.fine.stack, middle, best.yaw as f32);
-                if let Some(found) = found.filter(|found| found.score_mm > best.score_mm) {
+        for step_mm in HEIGHT_STEPS_MM {
+            for step_mm in [step_mm, -step_mm] {
+                let (from_mm, mut steps) = (top_mm, 0);
+                while steps < HEIGHT_STEPS_MAX {
+                    let trial_mm = from_mm + f64::from(steps + 1) * step_mm;
+                    let Some(found) = self.near(views, &best, trial_mm) else { break };
+                    if found.score_mm <= best.score_mm {
+                        break;
+                    }
                     (best, top_mm) = (found, trial_mm);
+                    steps += 1;
+                }
+                if steps > 0 {
+                    break;
                 }
             }
         }
         (best, top_mm)
+    }
+
+    /// A known border on another plane.
+    fn near(&mut self, views: &Views, border: &Rectangle, height_mm: f64) -> Option<Rectangle> {
+        if !(f64::from(HEIGHT_MIN_MM)..self.height_max_mm).contains(&height_mm) {
+            return None;
+        }
+        self.fine.fill(views, height_mm, border_of(border, NEAR_MM));
+        let middle = [border.x_mm as f32, border.y_mm as f32];
+        self.search.near(&self.fine.stack, middle, border.yaw as f32)
     }
 
     fn rectangle(
@@ -270,7 +316,7 @@ impl Parcels {
         &mut self,
         views: &Views,
         found: &Face,
-        fit: impl Fn(&Face) -> Option<Cuboid>,
+        mut fit: impl FnMut(&Face) -> Option<Cuboid>,
     ) -> Option<Face> {
         let content = self.scroll.content(found);
         if let Some(cuboid) = fit(found) {
@@ -290,46 +336,46 @@ impl Parcels {
     /// height of the cells there: a tube is widest at half its height.
     fn widened(&mut self, views: &Views, found: &Face, content: &Content) -> Face {
         let around = found.rectangle.shrunk(-enclosing::REACH_MM);
-        let cells = self.scroll.raised_within(&around);
-        let sides = Side::all(&around).map(|side| self.side_excess_mm(views, &side, &cells));
-        let excess_mm = sides.map(|found| found.unwrap_or(enclosing::REACH_MM));
+        self.scroll.look_within(&around);
+        let excess_mm = Side::all(&around)
+            .map(|side| self.side_excess_mm(views, &side).unwrap_or(enclosing::REACH_MM));
         let rectangle = around.moved_in(excess_mm, found.rectangle.sides);
         Face { rectangle, height_mm: content.highest_mm, ..*found }
     }
 
-    /// How far a side is outside of its outermost line of edges, at the height of the cells (X less the belt's travel,
-    /// Y, height) there.
-    fn side_excess_mm(
-        &mut self,
-        views: &Views,
-        side: &Side<'_>,
-        cells: &[[f64; 3]],
-    ) -> Option<f64> {
-        let here = cells.iter().filter(|[x_mm, y_mm, _]| side.has([*x_mm, *y_mm]));
-        let mut heights_mm: Vec<f64> = here.map(|cell| cell[2]).collect();
-        let height_mm = place_of(&mut heights_mm, 0.5);
+    /// How far a side is outside of its outermost line of edges, at the height of the cells there that are looked at.
+    fn side_excess_mm(&mut self, views: &Views, side: &Side<'_>) -> Option<f64> {
+        let height_mm = self.scroll.height_of(0.5, |at_mm| side.has(at_mm));
         self.fine.fill(views, height_mm, border_of(side.rectangle(), enclosing::REACH_MM));
         side.excess_mm(self.fine.stack.edges(), self.fine.stack.px_mm())
     }
 
-    /// What encloses cells that are raised in one piece, if they are around it on all sides.
-    fn enclose(&mut self, views: &Views, members: &[usize]) -> Option<Face> {
-        let cells: Vec<[f64; 3]> = members.iter().map(|&i| self.scroll.cell_mm(i)).collect();
-        let points: Vec<[f64; 2]> = cells.iter().map(|[x_mm, y_mm, _]| [*x_mm, *y_mm]).collect();
-        let around = enclosing::smallest_rectangle(&points);
+    /// What encloses the raised cells that are looked at, if they are around it on all sides.
+    fn enclose(&mut self, views: &Views, group: &Group) -> Option<Face> {
+        let around = self.scroll.smallest_rectangle();
+        if around.length_mm.min(around.width_mm) < SIDE_MIN_MM {
+            return None;
+        }
         let sides = Side::all(&around);
         let excess_mm = sides
             .each_ref()
-            .map(|side| self.side_excess_mm(views, side, &cells).unwrap_or(enclosing::SPREAD_MM));
-        let covered = sides.each_ref().map(|side| side.covered(&points, self.scroll.side_mm()));
+            .map(|side| self.side_excess_mm(views, side).unwrap_or(enclosing::SPREAD_MM));
+        let covered = sides.each_ref().map(|side| {
+            let places = self.scroll.members().map(|i| self.scroll.place_mm(i));
+            side.covered(places, self.scroll.side_mm())
+        });
         let rectangle = around.moved_in(excess_mm, covered);
-        let mut heights_mm: Vec<f64> = cells.iter().map(|cell| cell[2]).collect();
-        let height_mm = place_of(&mut heights_mm, HIGHEST_SHARE);
-        let narrower = [None; 4];
-        let face = Face { rectangle, narrower, height_mm, cells: members.len(), is_cuboid: false };
+        let height_mm = self.scroll.height_of(HIGHEST_SHARE, |_| true);
+        let (narrower, cells) = ([None; 4], group.cells);
+        let face = Face { rectangle, narrower, height_mm, cells, is_cuboid: false };
         let is_wide = rectangle.length_mm.min(rectangle.width_mm) > SIDE_MIN_MM;
         let is_thing = is_wide && is_border(&rectangle) && !self.scroll.content(&face).is_belt();
         is_thing.then_some(face)
+    }
+
+    /// Whether a border found is that of a cuboid that is already known.
+    fn is_known(&self, found: &Face) -> bool {
+        self.waiting.iter().chain(&self.gone).any(|known| known.is_cuboid && known.is_same(found))
     }
 
     /// Keep a face beside those that wait: of those at one place the best.
@@ -338,11 +384,10 @@ impl Parcels {
         if self.gone.iter().any(same) {
             return;
         }
-        let rivals: Vec<Face> = self.waiting.extract_if(.., |other| same(other)).collect();
-        if face.worth() > rivals.iter().map(Face::worth).sum() {
-            self.waiting.push(*face);
-        } else {
-            self.waiting.extend(rivals);
+        let rivals = self.waiting.iter().filter(|other| same(other));
+        if face.worth() > rivals.map(Face::worth).sum() {
+            self.waiting.retain(|other| !same(other));
+            self.overflows += u64::from(self.waiting.push(*face).is_err());
         }
     }
 }
@@ -353,13 +398,4 @@ fn border_of(rectangle: &Rectangle, margin_mm: f64) -> [[f64; 2]; 2] {
     let y_reach_mm = 0.5 * (rectangle.length_mm * sin.abs() + rectangle.width_mm * cos.abs());
     let around = |middle: f64, reach: f64| [middle - reach - margin_mm, middle + reach + margin_mm];
     [around(rectangle.x_mm, rectangle.reach_mm()), around(rectangle.y_mm, y_reach_mm)]
-}
-
-/// The value below which a share of them lies; 0 if there are none.
-fn place_of(values: &mut [f64], share: f64) -> f64 {
-    let place = (share * values.len() as f64) as usize;
-    if values.is_empty() {
-        return 0.0;
-    }
-    *values.select_nth_unstable_by(place.min(values.len() - 1), f64::total_cmp).1
 }

@@ -14,9 +14,9 @@ use crate::units::BeltRect;
 /// Directions tried: so many peaks of the edges' directions, ...
 const DIRECTIONS: usize = 4;
 /// ... each turned by this, degrees, in coarse pictures, ...
-const TURNS_DEG: [f32; 5] = [-1.5, -0.75, 0.0, 0.75, 1.5];
+const TURNS_DEG: [f32; 3] = [-1.0, 0.0, 1.0];
 /// ... and what is found by this in fine ones, ...
-const FINE_TURNS_DEG: [f32; 5] = [-0.5, -0.25, 0.0, 0.25, 0.5];
+const FINE_TURNS_DEG: [f32; 3] = [-0.5, 0.0, 0.5];
 /// ... so far around it, mm: three coarse pixels.
 pub const CROP_MM: f64 = 12.0;
 /// Around a known direction it is turned by this.

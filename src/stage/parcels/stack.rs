@@ -5,11 +5,12 @@
 //! (semblance), beyond what noise does there, and not part of a slow ramp: a shadow's soft border is
 //! as wide as its displacement and would look alike at every height.
 
-use super::steps::{STEP_ONE, Scale, StepPicture, Steps};
+use super::steps::{Scale, StepPicture, Steps};
 use crate::camera::BeltView;
 use crate::error::Result;
 use crate::kernel::Level;
 use crate::kernel::scalar::semblance::{StepRow, StepSums};
+use crate::kernel::scalar::steps::STEP_ONE;
 use crate::kernel::simd::semblance::add_steps;
 use crate::plan::{Block, Memory, Plan};
 use crate::stage::evidence::DARK_GREY;

@@ -6,8 +6,12 @@
 use crate::camera::BeltView;
 use crate::error::Result;
 use crate::image::Plane;
+use crate::kernel::Level;
 use crate::kernel::scalar::bits::{self, words};
-use crate::kernel::scalar::box_filter::{self, box_filter};
+use crate::kernel::scalar::box_filter;
+use crate::kernel::scalar::steps::Rows;
+use crate::kernel::simd::box_filter::box_filter;
+use crate::kernel::simd::steps::take_steps;
 use crate::plan::{Block, Memory, Plan};
 use crate::stage::evidence::DARK_GREY;
 use crate::stage::views::VIEWS_MAX;
@@ -17,10 +21,6 @@ const PX_MM: f64 = 2.0;
 /// Pixels of a coarse picture are twice as wide, if that is no more than this, mm: a small parcel still has
 /// sides.
 const COARSE_PX_MAX_MM: f64 = 5.0;
-/// A step of 1 in the logarithm, in units of a stored one.
-pub const STEP_ONE: f32 = 256.0;
-/// The longest step that is stored; longer ones keep their direction.
-const STEP_MOST: f32 = 127.0;
 
 /// How large the pixels are: what is sought is found in coarse pictures and looked at in fine ones.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -71,6 +71,7 @@ pub struct Steps {
     /// Pixels of the view to a side of a picture's.
     side_px: usize,
     size_px: [usize; 2],
+    level: Level,
     /// Logarithms of the mean, by the sum of a pixel's grey values.
     log_of_sum: Block<f32>,
     log: Block<f32>,
@@ -98,7 +99,13 @@ impl Steps {
     }
 
     /// None yet. `seen`: bit mask of the view's pixels that the camera sees.
-    pub fn new(view: &BeltView, scale: Scale, seen: &[u64], memory: &mut Memory) -> Result<Self> {
+    pub fn new(
+        view: &BeltView,
+        scale: Scale,
+        level: Level,
+        seen: &[u64],
+        memory: &mut Memory,
+    ) -> Result<Self> {
         let (side_px, size_px) = scale.sizes(view);
         let mut log_of_sum = memory.take(scale.name(LOG_OF_SUM), 0.0)?;
         let share = 1.0 / (side_px * side_px) as f32;
@@ -108,6 +115,7 @@ impl Steps {
         let mut steps = Self {
             side_px,
             size_px,
+            level,
             log_of_sum,
             log: memory.take(scale.name(LOG), 0.0)?,
             slow: memory.take(scale.name(SLOW), 0.0)?,
@@ -174,13 +182,8 @@ impl Steps {
             let line = |j: usize| &self.log[j * width..][..width];
             let [above, here, below] = [j - 1, j, j + 1].map(line);
             let out = j * width + 1..(j + 1) * width - 1;
-            let inside = width - 2;
-            let (left, right) = (&here[..inside], &here[2..]);
-            let (above, below) = (&above[1..][..inside], &below[1..][..inside]);
-            let steps = along[out.clone()].iter_mut().zip(&mut across[out]);
-            for (i, (along, across)) in steps.enumerate() {
-                [*along, *across] = stored([right[i] - left[i], above[i] - below[i]]);
-            }
+            let rows = Rows { above: &above[1..], here, below: &below[1..] };
+            take_steps(self.level, rows, &mut along[out.clone()], &mut across[out]);
         }
     }
 
@@ -205,7 +208,7 @@ impl Steps {
     fn take_out_slow_part(&mut self) {
         self.slow.copy_from_slice(&self.log);
         for _ in 0..PASSES {
-            box_filter(&mut self.slow, &mut self.scratch, self.size_px[0]);
+            box_filter(self.level, &mut self.slow, &mut self.scratch, self.size_px[0]);
         }
         for (log, slow) in self.log.iter_mut().zip(self.slow.iter()) {
             *log -= slow;
@@ -217,21 +220,3 @@ impl Steps {
 pub const REACH_PX: usize = PASSES * box_filter::REACH;
 /// Times that the box filter is applied.
 const PASSES: usize = 2;
-
-fn stored([x, y]: [f32; 2]) -> [i8; 2] {
-    let length = STEP_ONE * (x * x + y * y).sqrt();
-    let scale = STEP_ONE * STEP_MOST / length.max(STEP_MOST);
-    // Rounded to the nearest: a cast cuts off.
-    [x, y].map(|step| (scale * step + 0.5_f32.copysign(step)) as i32 as i8)
-}
-
-#[cfg(test)]
-mod tests {
-    use super::*;
-
-    #[test]
-    fn a_step_is_stored_with_its_direction_however_long() {
-        assert_eq!(stored([0.1, -0.2]), [26, -51]);
-        assert_eq!(stored([3.0, 4.0]), [76, 102], "of length 127");
-    }
-}

@@ -1,0 +1,85 @@
+//! What the cells within a border tell of it.
+
+use super::face::{Face, STEP_MM};
+use super::scroll::{Scroll, place_of};
+
+/// A cell within this is the belt's, mm.
+const BELT_MM: f64 = 1.2;
+/// Cells so far inside of a border are its own, mm.
+const BORDER_MM: f64 = 10.0;
+/// A thing is as high as this share of its cells: a few scatter.
+pub const HIGHEST_SHARE: f64 = 0.95;
+/// At a top face's border this share of the cells tells its height.
+const BORDER_LEVEL_MIN: f64 = 0.2;
+/// On a parcel at most this many cells for one that is raised lie on the belt.
+const BELT_SHARE_MAX: f64 = 0.3;
+/// What has no top face is full of raised cells: this share.
+const RAISED_SHARE_MIN: f64 = 0.5;
+
+/// What the cells within a border tell: shares of them.
+pub struct Content {
+    on_belt: f64,
+    raised: f64,
+    /// At the border's height: of all, and of those along the border.
+    level: f64,
+    border_level: f64,
+    /// Beyond it.
+    higher: f64,
+    /// What nearly none of the raised ones exceeds, mm.
+    pub highest_mm: f64,
+}
+
+impl Content {
+    /// Whether the belt shows within.
+    pub fn is_belt(&self) -> bool {
+        self.on_belt >= BELT_SHARE_MAX * self.raised
+    }
+
+    /// Whether this is what the cells of a top face tell.
+    pub fn is_top(&self) -> bool {
+        self.border_level > BORDER_LEVEL_MIN && self.higher <= self.level && !self.is_belt()
+    }
+
+    /// Whether this is what the cells of a thing tell whose border is not at its top.
+    pub fn is_heap(&self) -> bool {
+        self.raised > RAISED_SHARE_MIN && self.higher > self.level && !self.is_belt()
+    }
+}
+
+impl Scroll {
+    /// What the cells within a face's border tell.
+    pub fn content(&mut self, face: &Face) -> Content {
+        let [mut all, mut on_belt, mut raised, mut level, mut higher] = [0usize; 5];
+        let [mut border, mut border_level] = [0usize; 2];
+        for i in 0..self.len() {
+            let [x_mm, y_mm] = self.place_mm(i);
+            let outside_mm = face.rectangle.outside_mm(x_mm, y_mm);
+            if outside_mm > 0.0 {
+                continue;
+            }
+            let at_border = outside_mm > -BORDER_MM;
+            all += 1;
+            border += usize::from(at_border);
+            let height_mm = self.height_mm(i);
+            if self.is_raised(i) {
+                let is_level = (height_mm - face.height_mm).abs() <= STEP_MM;
+                self.scratch[raised] = height_mm;
+                raised += 1;
+                level += usize::from(is_level);
+                border_level += usize::from(is_level && at_border);
+                higher += usize::from(height_mm > face.height_mm + STEP_MM);
+            } else {
+                on_belt += usize::from(self.cells[i].strength > 0.0 && height_mm.abs() <= BELT_MM);
+            }
+        }
+        let share = |count: usize, of: usize| count as f64 / of.max(1) as f64;
+        Content {
+            on_belt: share(on_belt, all),
+            raised: share(raised, all),
+            level: share(level, all),
+            border_level: share(border_level, border),
+            higher: share(higher, all),
+            highest_mm: place_of(&mut self.scratch[..raised], HIGHEST_SHARE),
+        }
+    }
+}
