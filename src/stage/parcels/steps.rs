@@ -49,7 +49,7 @@ impl Scale {
 /// The steps of one view.
 #[derive(Clone, Copy)]
 pub struct StepPicture<'a> {
-    /// Along X, from dark to bright, in units of 1 / [`STEP_ONE`].
+    /// Along X, from dark to bright, in units of 1 / [`STEP_ONE`](crate::kernel::scalar::steps::STEP_ONE).
     pub along: &'a [i8],
     /// Along Y.
     pub across: &'a [i8],
