@@ -184,3 +184,28 @@ fn a_tube_and_a_bag_are_enclosed() {
         assert!(!face.is_cuboid, "{parcel:?}");
     }
 }
+
+/// In the middle of the zone when the recording ends.
+const LAST: &str = r#"
+[[parcel]]
+length_mm = 240.0
+width_mm = 160.0
+height_mm = 60.0
+yaw_deg = 30.0
+x_mm = -1200.0
+y_mm = 60.0
+material = "kraft"
+"#;
+
+#[test]
+fn what_is_in_the_zone_at_the_end_is_told() {
+    let Seen { scenario, faces, offset_mm, .. } = look_at(LAST, 76);
+    let [face] = faces[..] else { panic!("{faces:?}") };
+    let parcel = &scenario.parcels()[0];
+    let r = &face.rectangle;
+    let off_mm = (r.x_mm + offset_mm - parcel.x_mm).hypot(r.y_mm - parcel.y_mm);
+    let sides = [r.length_mm.max(r.width_mm), r.length_mm.min(r.width_mm)];
+    let near = |found_mm: f64, true_mm: f64| (found_mm - true_mm).abs() < BORDER_MM;
+    assert!(near(off_mm, 0.0) && near(sides[0], 240.0) && near(sides[1], 160.0), "{face:?}");
+    assert!(face.is_cuboid && (face.height_mm - 60.0).abs() < HEIGHT_MM, "{face:?}");
+}

@@ -111,6 +111,7 @@ impl Passes {
 
     /// The belt has ended, or its position was lost: what is left is all that comes.
     pub fn finish(&mut self, emit: &mut dyn FnMut(&Passed)) {
+        self.evidence.finish(&self.views);
         self.taken = self.evidence.decided().end;
         self.parcels.take_columns(&self.evidence);
         while self.look(true) {}
@@ -145,6 +146,7 @@ impl Passes {
         if let Some((measured, travel_sigma)) = self.fit.measure(&self.views, face)
             && let Some(newest) = newest
         {
+            self.parcels.told(face);
             emit(&Passed { face: *face, measured, travel_sigma, newest });
         }
     }

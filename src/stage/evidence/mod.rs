@@ -216,18 +216,33 @@ impl Evidence {
         self.cells.add(views.grey(place), place);
     }
 
-    /// Decide what has passed the zone by now.
+    /// Decide what has passed most of the zone by now.
     pub fn advance(&mut self, views: &Views, travel_mm: f64, breaks: u32) {
-        // The last column whose middle has passed the end of the zone.
         let end_mm = self.zone.x_max_mm - AHEAD_SHARE * self.zone.length_mm();
-        let passed = ((travel_mm - end_mm) / self.cell_mm).floor() as i64;
+        let passed = self.last_behind(end_mm, travel_mm);
         if self.next.is_none() || breaks != self.breaks {
             self.breaks = breaks;
             self.next = Some(passed);
             self.first = passed;
             return;
         }
-        while let Some(next) = self.next.filter(|&next| next <= passed) {
+        self.decide_until(passed, views);
+    }
+
+    /// No more views come: decide what was seen at all.
+    pub fn finish(&mut self, views: &Views) {
+        let Some(place) = views.newest() else { return };
+        let seen = self.last_behind(self.zone.x_min_mm, views.kept(place).at.travel_mm);
+        self.decide_until(seen, views);
+    }
+
+    /// The last column whose middle is behind an X.
+    fn last_behind(&self, x_mm: f64, travel_mm: f64) -> i64 {
+        ((travel_mm - x_mm) / self.cell_mm).floor() as i64
+    }
+
+    fn decide_until(&mut self, last: i64, views: &Views) {
+        while let Some(next) = self.next.filter(|&next| next <= last) {
             self.sum_up(views, next);
             self.decide(next - 2);
             self.next = Some(next + 1);

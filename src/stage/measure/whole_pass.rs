@@ -68,11 +68,14 @@ impl WholePass {
     }
 
     /// Measure the parcel of a face from the views of its pass; X holds at the newest view's belt position. With it the
-    /// relative standard uncertainty of the belt's travel over the pass. What has no cuboid's edges is as large as the
-    /// face found of it.
+    /// relative standard uncertainty of the belt's travel over the pass. None if the face is a cuboid's and the edges, now
+    /// that all are seen, are none. What is no cuboid is as large as the face found of it.
     pub fn measure(&mut self, views: &Views, face: &Face) -> Option<(Measured, f64)> {
-        let fitted = if face.is_cuboid { self.fit(views, face) } else { None };
-        fitted.filter(|(measured, _)| measured.is_box).or_else(|| self.enclose(views, face))
+        if face.is_cuboid {
+            self.fit(views, face).filter(|(measured, _)| measured.is_box)
+        } else {
+            self.enclose(views, face)
+        }
     }
 
     /// The cuboid that the edges around a face show, if it lies over the belt.

@@ -17,6 +17,10 @@ const SIDE_MM: f64 = SPREAD_MM;
 const OVERLAP_SHARE: f64 = 0.3;
 /// Two cuboids that reach further into each other are one parcel's, mm.
 const CUBOID_DEPTH_MM: f64 = 5.0;
+/// Cells of a border lower than this tell the belt, too, mm: the mean of both within what an edge spreads ...
+const FLAT_MM: f64 = 7.0;
+/// ... so that its edges alone must tell it: this share of them.
+const FLAT_SUPPORT_MIN: f64 = 0.9;
 /// Two borders are one when so much of each lies inside the other.
 const SAME_SHARE: f64 = 0.95;
 /// What differs less in height is at one height, mm.
@@ -59,6 +63,11 @@ impl Face {
     pub fn owns(&self, cell: &Cell, [x_mm, y_mm]: [f64; 2]) -> bool {
         f64::from(cell.height_mm) < self.height_mm + STEP_MM
             && self.rectangle.outside_mm(x_mm, y_mm) < SIDE_MM
+    }
+
+    /// Whether it is too near to the belt for cells to tell one from the other, and a whole border tells it.
+    pub fn is_flat(&self) -> bool {
+        self.height_mm < FLAT_MM && self.rectangle.support() > FLAT_SUPPORT_MIN
     }
 
     /// Whether two faces have one border at one height.

@@ -5,7 +5,8 @@
 //! stacked on the plane of that height show its whole border sharp; the rectangle around the beginning
 //! whose four sides are explained best is the face. Edges tell the cuboid then, and the cells within tell whether it is
 //! one: where they are higher than its top, it is the outline of a bag or a stack; where they lie on the belt, it
-//! is nothing. What is raised and belongs to no face, as a tube, is enclosed as it is.
+//! is nothing, but for a face so flat that only its edges tell it; where a surface at its height goes on beyond its border,
+//! it is a line on something larger. What is raised and belongs to no face, as a tube, is enclosed as it is.
 
 mod content;
 mod enclosing;
@@ -175,13 +176,19 @@ impl Parcels {
         true
     }
 
-    /// The next parcel whose trailing end has passed `end_mm`, X less the belt's travel.
+    /// The next parcel whose trailing end has passed `end_mm`, X less the belt's travel. What is not told of it then is
+    /// left over.
     pub fn next_passed(&mut self, end_mm: f64) -> Option<Face> {
         let has_passed = |face: &Face| face.rectangle.trailing_mm() > end_mm;
-        let place = self.waiting.iter().position(has_passed)?;
-        let face = self.waiting.remove(place);
-        self.let_go(&face);
-        Some(face)
+        loop {
+            let place = self.waiting.iter().position(has_passed)?;
+            let face = self.waiting.remove(place);
+            let others = self.waiting.iter().chain(&self.gone);
+            // What a border within something larger belongs to is left over.
+            if !face.is_cuboid || !self.scroll.goes_on_beyond(&face, &others) {
+                return Some(face);
+            }
+        }
     }
 
     /// The next thing that has passed `end_mm` and that no face explains.
@@ -189,16 +196,16 @@ impl Parcels {
         loop {
             let known = self.waiting.iter().chain(&self.gone);
             let group = self.scroll.look_at_left_over(&known, end_mm)?;
-            if let Some(face) = self.enclose(views, &group) {
-                self.let_go(&face);
-                return Some(face);
-            }
+            let found = self.enclose(views, &group);
             self.scroll.settle();
+            if found.is_some() {
+                return found;
+            }
         }
     }
 
-    /// A parcel was passed on: what comes of its cells is known.
-    fn let_go(&mut self, face: &Face) {
+    /// A parcel was told: what comes of its cells is known.
+    pub fn told(&mut self, face: &Face) {
         if self.gone.is_full() {
             self.gone.remove(0);
         }
@@ -322,10 +329,12 @@ impl Parcels {
         if let Some(cuboid) = fit(found) {
             let (rectangle, height_mm) = (cuboid.rectangle, cuboid.height_mm);
             let fitted = Face { rectangle, height_mm, is_cuboid: true, ..*found };
-            if cuboid.is_box && self.scroll.content(&fitted).is_top() {
+            let within = self.scroll.content(&fitted);
+            if cuboid.is_box && (within.is_top() || fitted.is_flat() && within.is_low()) {
                 return Some(fitted);
             }
-            if content.is_top() {
+            let others = self.waiting.iter().chain(&self.gone);
+            if content.is_top() && !self.scroll.goes_on_beyond(found, &others) {
                 return Some(self.widened(views, found, &content));
             }
         }
