@@ -72,7 +72,10 @@ impl WholePass {
     /// that all are seen, are none. What is no cuboid is as large as the face found of it.
     pub fn measure(&mut self, views: &Views, face: &Face) -> Option<(Measured, f64)> {
         if face.is_cuboid {
-            self.fit(views, face).filter(|(measured, _)| measured.is_box)
+            let mut fitted = self.fit(views, face).filter(|(measured, _)| measured.is_box)?;
+            // It was over the belt by the views until then.
+            fitted.0.disputed |= fitted.0.estimate.params[HEIGHT] < HEIGHT_MIN_MM;
+            Some(fitted)
         } else {
             self.enclose(views, face)
         }
@@ -82,6 +85,10 @@ impl WholePass {
     pub fn cuboid(&mut self, views: &Views, face: &Face) -> Option<Cuboid> {
         let (measured, _) = self.fit_border(views, &face.rectangle, face.height_mm, ROUNDS)?;
         let p = &measured.estimate.params;
+        // What lies on the belt itself, its texture or a label stuck to it, is no parcel.
+        if p[HEIGHT] < HEIGHT_MIN_MM {
+            return None;
+        }
         let rectangle = Rectangle {
             x_mm: p[X] - views.kept(views.newest()?).at.travel_mm,
             y_mm: p[Y],
@@ -181,10 +188,6 @@ impl WholePass {
             best = Some(fitted);
         }
         let estimate = best.filter(|estimate| estimate.edge_count > 0)?;
-        // What lies on the belt itself, its texture or a label stuck to it, is no parcel.
-        if estimate.params[HEIGHT] < HEIGHT_MIN_MM {
-            return None;
-        }
         // What has shrunk to a line was one: the border of a shadow, a seam.
         if estimate.params[LENGTH].min(estimate.params[WIDTH]) < LINE_MM {
             return None;
