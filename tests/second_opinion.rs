@@ -64,6 +64,11 @@ struct Seen {
 }
 
 fn look_at(parcels: &str, frames: u32) -> Seen {
+    look_at_broken(parcels, frames, u64::MAX)
+}
+
+/// From frame `broken` on the belt's position has nothing to do with what it was.
+fn look_at_broken(parcels: &str, frames: u32, broken: u64) -> Seen {
     let camera = common::camera_above([1280, 800], 680.0, 1500.0, [-0.18, 0.08, 0.0, 0.0, -0.008]);
     let text = format!(
         "seed = 5\nfps = 30\nframes = {frames}\nexposure_ms = 1.5\n{camera}\
@@ -88,7 +93,8 @@ fn look_at(parcels: &str, frames: u32) -> Seen {
     while let Some(time) = source.next_into(frame).expect("frames") {
         let raw = Plane::packed(frame, 1280, 800).expect("its size");
         pipeline.step(raw, time, &mut |_| ()).expect("measures");
-        let at = pipeline.belt_position();
+        let mut at = pipeline.belt_position();
+        at.breaks += u32::from(time.index >= broken);
         passes.step(pipeline.pixels(), at, time, &mut |passed| faces.push(passed.face));
         offset_mm = scenario.travel_at_frame_mm(time.index) - at.travel_mm;
     }
@@ -207,5 +213,13 @@ fn what_is_in_the_zone_at_the_end_is_told() {
     let sides = [r.length_mm.max(r.width_mm), r.length_mm.min(r.width_mm)];
     let near = |found_mm: f64, true_mm: f64| (found_mm - true_mm).abs() < BORDER_MM;
     assert!(near(off_mm, 0.0) && near(sides[0], 240.0) && near(sides[1], 160.0), "{face:?}");
+    assert!(face.is_cuboid && (face.height_mm - 60.0).abs() < HEIGHT_MM, "{face:?}");
+}
+
+#[test]
+fn what_is_in_the_zone_when_the_belt_s_position_breaks_is_told_once() {
+    // In frame 45 all of it is in the zone, its middle 450 mm before the zone's.
+    let Seen { faces, .. } = look_at_broken(LAST, 140, 45);
+    let [face] = faces[..] else { panic!("{faces:?}") };
     assert!(face.is_cuboid && (face.height_mm - 60.0).abs() < HEIGHT_MM, "{face:?}");
 }

@@ -84,6 +84,11 @@ impl Explainer {
     pub fn finish(mut self, pipeline: &Pipeline) -> Result<()> {
         let Self { passes, records, .. } = &mut self;
         passes.finish(&mut |passed| records.extend(told(pipeline.site(), passed, records.len())));
+        let overflows = passes.overflows();
+        if overflows > 0 {
+            tracing::warn!("{overflows} parcels more than the second opinion has room for");
+        }
+        self.draw();
         let path = self.folder.join("parcels.jsonl");
         let io = |e: std::io::Error| Error::failure(format!("cannot write: {e}")).in_file(&path);
         let mut file = std::fs::File::create(&path).map_err(io)?;

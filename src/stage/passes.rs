@@ -18,6 +18,8 @@ use crate::units::BeltRect;
 
 /// Columns of cells between two looks for parcels.
 const LOOK_COLUMNS: i64 = 8;
+/// Before any column: they begin anywhere.
+const NONE_TAKEN: i64 = i64::MIN / 2;
 
 /// A parcel whose pass is over.
 pub struct Passed {
@@ -68,8 +70,7 @@ impl Passes {
         let evidence = Evidence::new(view, zone, height_max_mm, level, seen, memory)?;
         let parcels = Parcels::new(view, zone, &evidence, height_max_mm, level, seen, memory)?;
         let fit = WholePass::new(view, zone, height_max_mm, rounding, seen, memory)?;
-        // Columns begin anywhere.
-        let (taken, busy, breaks) = (i64::MIN / 2, false, 0);
+        let (taken, busy, breaks) = (NONE_TAKEN, false, 0);
         Ok(Self { zone: *zone, views, evidence, parcels, fit, taken, busy, breaks })
     }
 
@@ -83,8 +84,9 @@ impl Passes {
     ) {
         if at.breaks != self.breaks {
             // What was before has no place in what comes.
-            self.finish(emit);
-            self.breaks = at.breaks;
+            self.emit_all(emit);
+            self.parcels.forget();
+            (self.taken, self.breaks) = (NONE_TAKEN, at.breaks);
         }
         if self.views.offer(pixels, at, time)
             && let Some(place) = self.views.newest()
@@ -109,14 +111,24 @@ impl Passes {
         self.emit_passed(end_mm, emit);
     }
 
-    /// The belt has ended, or its position was lost: what is left is all that comes.
+    /// The belt has ended: what was seen at all is all that comes.
     pub fn finish(&mut self, emit: &mut dyn FnMut(&Passed)) {
         self.evidence.finish(&self.views);
+        self.emit_all(emit);
+    }
+
+    /// Emit what is decided by now, wherever it is.
+    fn emit_all(&mut self, emit: &mut dyn FnMut(&Passed)) {
         self.taken = self.evidence.decided().end;
         self.parcels.take_columns(&self.evidence);
         while self.look(true) {}
         self.emit_passed(f64::NEG_INFINITY, emit);
         self.emit_left_over(f64::NEG_INFINITY, emit);
+    }
+
+    /// Parcels that were found and for which there was no room.
+    pub fn overflows(&self) -> u64 {
+        self.parcels.overflows()
     }
 
     /// Heights of the belt.

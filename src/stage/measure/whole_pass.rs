@@ -26,9 +26,9 @@ const HEIGHT_MIN_MM: f64 = 2.4;
 const LINE_MM: f64 = 6.0;
 /// Times that the profiles are taken anew, where the last fit has the edges.
 const ROUNDS: usize = 3;
-/// Of a border that may be another one's part, until it is seen to explain more; and of a cuboid that was fitted
-/// before its pass was whole.
+/// The same for a cuboid that was fitted before its pass was whole.
 const ROUNDS_AGAIN: usize = 2;
+/// The same for a border further inside, until it is seen to explain more.
 const ROUNDS_RIVAL: usize = 1;
 
 /// The fit, and its memory.

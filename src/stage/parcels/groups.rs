@@ -19,7 +19,7 @@ const BESIDE_CELLS: usize = 6;
 const AREA_MIN_MM2: f64 = 512.0;
 /// Cells so near to a face are its own, whatever they tell, mm: an edge spreads them by four.
 const HALO_MM: f64 = 25.0;
-/// Groups of which the largest is chosen; when there are more, the first of them.
+/// Groups of which the largest is chosen; of more the smallest are left out.
 const GROUPS_MAX: usize = 256;
 
 /// Where a group is, and how high.
@@ -55,6 +55,16 @@ impl Extent {
             && a <= f + BESIDE_CELLS
             && g <= d + BESIDE_CELLS
             && c <= h + BESIDE_CELLS
+    }
+}
+
+/// Keep a group, in place of the smallest one when there is no room.
+fn keep(groups: &mut heapless::Vec<Found, GROUPS_MAX>, group: Found) {
+    if let Err(group) = groups.push(group)
+        && let Some(smallest) = groups.iter_mut().min_by_key(|group| group.cells)
+        && group.cells > smallest.cells
+    {
+        *smallest = group;
     }
 }
 
@@ -99,11 +109,11 @@ impl Scroll {
             }
             for k in 0..usable {
                 let start = self.usable[k] as usize;
-                if self.here[start] && !found.is_full() {
+                if self.here[start] {
                     self.connect(start, GAP);
                     if self.member_count >= self.cells_min() {
                         let (cells, extent) = (self.member_count, self.extent());
-                        let _ = found.push(Found { cells, start, plane, extent });
+                        keep(&mut found, Found { cells, start, plane, extent });
                     }
                 }
             }

@@ -158,6 +158,13 @@ impl Parcels {
         self.gone.retain(|face| face.rectangle.trailing_mm() < first_mm);
     }
 
+    /// Another belt begins, after the last one's parcels were passed on.
+    pub fn forget(&mut self) {
+        self.scroll.forget();
+        self.waiting.clear();
+        self.gone.clear();
+    }
+
     /// Look at what most cells begin (of all, once the belt has `ended`). Returns whether there was anything. `fit`: the
     /// cuboid that the edges around a face show, if it lies over the belt.
     pub fn look(

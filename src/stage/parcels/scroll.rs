@@ -88,6 +88,9 @@ impl Scroll {
     /// Columns decided since the last time, less what `faces` own; old ones go.
     pub fn take_columns<'a>(&mut self, evidence: &Evidence, faces: impl Iterator<Item = &'a Face>) {
         let decided = evidence.decided();
+        if self.columns == 0 {
+            self.grid.first = decided.start;
+        }
         if decided.start > self.grid.first {
             let gone = ((decided.start - self.grid.first) as usize).min(self.columns);
             let kept = gone * self.rows()..self.columns * self.rows();
@@ -114,6 +117,11 @@ impl Scroll {
         for face in faces {
             self.claim_from(fresh, face);
         }
+    }
+
+    /// Another belt begins: its columns may have the numbers of these.
+    pub fn forget(&mut self) {
+        self.columns = 0;
     }
 
     /// Cells known.
