@@ -2,8 +2,8 @@
 
 use beltgauge::config::Web;
 use beltgauge::event::{Flags, NotMeasured, ParcelRecord, Shape};
+use beltgauge::plc::codes::REASONS;
 use beltgauge::plc::command::COMMANDS;
-use beltgauge::plc::registers::REASONS;
 use beltgauge::web::{self, Archived, Board, Event, Machine, NoPicture, Parcel, Plc, State, View};
 use std::collections::{BTreeMap, BTreeSet};
 use std::io::{ErrorKind, Read, Write};
@@ -454,8 +454,8 @@ fn every_word_is_there_in_both_languages() {
     let mut needed: BTreeSet<String> = BTreeSet::new();
     needed.extend(Flags::ALL.iter().map(|(_, name, _)| format!("flag.{name}")));
     needed.extend(NotMeasured::ALL.iter().map(|(_, name, _)| format!("not_measured.{name}")));
-    needed.extend(COMMANDS.iter().map(|(code, _)| format!("command.{code}")));
-    for (code, _) in REASONS {
+    needed.extend(COMMANDS.iter().map(|(code, ..)| format!("command.{code}")));
+    for (code, ..) in REASONS {
         needed.extend([format!("reason.{code}"), format!("remedy.{code}")]);
     }
     for why in NoPicture::ALL {

@@ -14,15 +14,24 @@ pub enum Request {
     MmPerCount(f64),
 }
 
-/// Codes of the commands and their meanings.
-pub const COMMANDS: [(u16, &str); 6] = [
-    (1, "acknowledge parcels up to sequence number `argument`, as register `acknowledge` does"),
-    (2, "learn the empty belt anew: takes background.learn_frames, parcels in view are forgotten"),
-    (3, "start: report parcels"),
-    (4, "stop: report none until started"),
-    (5, "round dimensions to multiples of `argument` tenths of a mm, 1 to 500"),
+/// Codes of the commands, their names in the kits and their meanings.
+pub const COMMANDS: [(u16, &str, &str); 6] = [
+    (
+        1,
+        "acknowledge",
+        "acknowledge parcels up to sequence number `argument`, as register `acknowledge` does",
+    ),
+    (
+        2,
+        "learn",
+        "learn the empty belt anew: takes background.learn_frames, parcels in view are forgotten",
+    ),
+    (3, "start", "start: report parcels"),
+    (4, "stop", "stop: report none until started"),
+    (5, "round", "round dimensions to multiples of `argument` tenths of a mm, 1 to 500"),
     (
         6,
+        "correct_encoder",
         "correct the encoder's scale by the belt's texture: mm_per_count becomes mm_per_count_seen, for good; refused when they differ by more than 40 %",
     ),
 ];
@@ -65,19 +74,21 @@ pub enum Outcome {
 }
 
 impl Outcome {
-    /// Codes and meanings.
-    pub const ALL: [(Self, &str); 7] = [
-        (Self::None, "no command yet"),
-        (Self::Done, "done"),
-        (Self::Unknown, "no such command"),
-        (Self::Argument, "argument out of range: nothing was changed"),
-        (Self::Busy, "busy with earlier commands: try again with the next ticket"),
+    /// Codes, names in the kits, and meanings.
+    pub const ALL: [(Self, &str, &str); 7] = [
+        (Self::None, "none", "no command yet"),
+        (Self::Done, "done", "done"),
+        (Self::Unknown, "unknown_command", "no such command"),
+        (Self::Argument, "argument_out_of_range", "argument out of range: nothing was changed"),
+        (Self::Busy, "busy", "busy with earlier commands: try again with the next ticket"),
         (
             Self::TicketUsed,
+            "ticket_used",
             "the last command, another one, had this ticket: nothing was done, take the next ticket",
         ),
         (
             Self::NotKnown,
+            "not_known",
             "what it needs is not known: no encoder, or the belt has not travelled far enough",
         ),
     ];

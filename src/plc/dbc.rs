@@ -1,8 +1,8 @@
 //! The CAN messages as a DBC file, from the same tables as the frames.
 
+use super::codes::REASONS;
 use super::command::COMMANDS;
 use super::frames::{self, Message, Place};
-use super::registers::REASONS;
 use super::table::{Field, Type};
 use std::fmt::Write;
 
@@ -90,9 +90,19 @@ pub fn document(base_id: u16) -> String {
     comments(&mut text, base_id);
     attributes(&mut text, base_id);
     let heartbeat = base_id + Message::Heartbeat as u16;
-    values(&mut text, heartbeat, "reason", REASONS.iter().map(|(code, meaning)| (*code, *meaning)));
+    values(
+        &mut text,
+        heartbeat,
+        "reason",
+        REASONS.iter().map(|(code, _, meaning)| (*code, *meaning)),
+    );
     let command = base_id + Message::Command as u16;
-    values(&mut text, command, "command", COMMANDS.iter().map(|(code, meaning)| (*code, *meaning)));
+    values(
+        &mut text,
+        command,
+        "command",
+        COMMANDS.iter().map(|(code, _, meaning)| (*code, *meaning)),
+    );
     text
 }
 

@@ -1,11 +1,12 @@
 //! The register map as documents: Markdown to read, CSV to import.
 
+use super::codes::REASONS;
 use super::command::{COMMANDS, Outcome};
 use super::frames;
 use super::link::REPEATED;
 use super::registers::{
     COMMAND, COMMAND_COUNT, COMMAND_FIELDS, COUNT, LATEST, MAP_VERSION, PARCEL_FIELDS,
-    PARCEL_STRIDE, QUEUE_HEAD, REASONS, RING, RING_PARCELS, STATUS_FIELDS,
+    PARCEL_STRIDE, QUEUE_HEAD, RING, RING_PARCELS, STATUS_FIELDS,
 };
 use super::table::Field;
 use crate::event::{Flags, NotMeasured};
@@ -44,7 +45,7 @@ pub fn markdown() -> String {
     );
     table(&mut text, STATUS_FIELDS, 0);
     text.push_str("\nCodes of `reason`, the first that holds:\n\n| code | meaning |\n|---|---|\n");
-    for (code, meaning) in REASONS {
+    for (code, _, meaning) in REASONS {
         let _ = writeln!(text, "| {code} | {meaning} |");
     }
     let _ = writeln!(
@@ -64,11 +65,11 @@ pub fn markdown() -> String {
     );
     table(&mut text, COMMAND_FIELDS, COMMAND);
     text.push_str("\n| command | what it does |\n|---|---|\n");
-    for (code, meaning) in COMMANDS {
+    for (code, _, meaning) in COMMANDS {
         let _ = writeln!(text, "| {code} | {meaning} |");
     }
     text.push_str("\n| result | meaning |\n|---|---|\n");
-    for (outcome, meaning) in Outcome::ALL {
+    for (outcome, _, meaning) in Outcome::ALL {
         let _ = writeln!(text, "| {} | {meaning} |", outcome as u16);
     }
     let _ = writeln!(

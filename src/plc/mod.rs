@@ -3,6 +3,7 @@
 pub mod bus;
 pub mod can;
 pub mod clients;
+pub mod codes;
 pub mod command;
 pub mod dbc;
 pub mod document;

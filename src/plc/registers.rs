@@ -4,6 +4,7 @@
 //! sequence number first and last, so that a client that reads it in two requests can tell whether
 //! it changed in between.
 
+use super::codes::{FAULT_BITS, STATUS_BITS, VALID_BITS};
 use super::health::{Concern, HealthStatus};
 use super::journal::Keeping;
 use super::table::{Field, fields};
@@ -180,48 +181,6 @@ pub struct Status {
     pub mm_per_count: Option<f64>,
 }
 
-/// What is wrong or worth knowing: code and meaning.
-pub const REASONS: [(u16, &str); 26] = [
-    (0, "all is well"),
-    (1, "the frame source has ended or failed"),
-    (2, "no frames arrive"),
-    (3, "CAN: bus off"),
-    (4, "CAN: interface down or not there"),
-    (5, "CAN: error passive, nobody acknowledges"),
-    (6, "the encoder does not count"),
-    (7, "the PLC is silent"),
-    (8, "the empty belt is being learned"),
-    (9, "stopped by command"),
-    (10, "a parcel found the queue full and was never acknowledged, since start"),
-    (11, "a table or queue has been full since start, see the counters"),
-    (12, "the camera is not there, or does not do what the configuration asks for: see the log"),
-    (13, "the last configuration that was imported was refused: see its report"),
-    (
-        14,
-        "the disk fails: sequence numbers, acknowledgments and tickets would not survive a restart; see the log",
-    ),
-    (
-        15,
-        "the encoder and the belt disagree: see encoder_ratio; correct encoder.mm_per_count, or give command 6",
-    ),
-    (16, "the belt does not run as configured: see belt_seen for its speed and direction"),
-    (17, "the belt's texture repeats itself, so that its motion is ambiguous: fit an encoder"),
-    (18, "the belt's texture or the camera's noise is so strong that it hides parcels"),
-    (
-        19,
-        "of the frames of the last 10 s more than 1 in 100 are missing: see frames_dropped, frames_lost, frames_torn",
-    ),
-    (
-        20,
-        "the archive: its disk fails or does not answer, entries were lost, or damage was found, since start; see the page",
-    ),
-    (21, "the camera has moved a little: see camera_moved, camera_error; fasten it"),
-    (22, "the camera has moved so far that sizes and places are wrong: calibrate the belt again"),
-    (23, "the picture is less sharp than it should be: see blur; clean and focus the lens"),
-    (24, "the picture is so unsharp that heights are wrong: see blur; focus the lens"),
-    (25, "the light has changed, or the lens is dirty: see light_region, light_change"),
-];
-
 impl Status {
     /// Belt travel of an encoder's count, as the belt's texture shows it.
     pub fn mm_per_count_seen(&self) -> Option<f64> {
@@ -241,7 +200,7 @@ impl Status {
 
     /// Word of status bits.
     pub fn status_bits(&self) -> u16 {
-        bits([
+        bits::<{ STATUS_BITS.len() }>([
             self.running,
             self.vision.ready,
             self.vision.belt_measured,
@@ -254,7 +213,7 @@ impl Status {
 
     /// Word of fault bits.
     pub fn fault_bits(&self) -> u16 {
-        bits([
+        bits::<{ FAULT_BITS.len() }>([
             self.vision.source_ended,
             self.overflows() > 0,
             self.queue_overflows > 0,
@@ -273,7 +232,7 @@ impl Status {
         ])
     }
 
-    /// Code of what matters most: see [`REASONS`].
+    /// Code of what matters most: see [`super::codes::REASONS`].
     pub fn reason(&self) -> u16 {
         self.reasons().next().unwrap_or(0)
     }
@@ -311,6 +270,7 @@ impl Status {
     }
 }
 
+/// A word of bits, from bit 0; as many as there are names.
 fn bits<const N: usize>(set: [bool; N]) -> u16 {
     set.iter().enumerate().map(|(i, set)| u16::from(*set) << i).sum()
 }
@@ -417,7 +377,7 @@ fn quality(sigma_mm: f64) -> f64 {
 #[rustfmt::skip]
 pub const PARCEL_FIELDS: &[ParcelField] = fields![
     [0, V1_0, "sequence", U32, "", 1.0, "from 1; 0 = no parcel yet", |p| f64::from(p.seq)],
-    [2, V2_0, "valid", U16, "bits", 1.0, "bit 0 the dimensions may be used: sort by them only then; bit 1 its shape is a box; bit 2 the encoder told the belt's motion; bit 3 it was measured", |p| f64::from(bits([p.may_be_used, p.shape == Shape::Box, p.by_encoder, p.not_measured.is_none()]))],
+    [2, V2_0, "valid", U16, "bits", 1.0, "bit 0 the dimensions may be used: sort by them only then; bit 1 its shape is a box; bit 2 the encoder told the belt's motion; bit 3 it was measured", |p| f64::from(bits::<{ VALID_BITS.len() }>([p.may_be_used, p.shape == Shape::Box, p.by_encoder, p.not_measured.is_none()]))],
     [3, V1_0, "flags", U16, "bits", 1.0, "doubts, see below", |p| f64::from(p.flags.bits())],
     [4, V1_0, "length", U16, "mm", 10.0, "longer side of the footprint, or as plc.order says", |p| p.length_mm],
     [5, V1_0, "width", U16, "mm", 10.0, "shorter side of the footprint, or as plc.order says", |p| p.width_mm],
@@ -496,6 +456,7 @@ impl RegisterImage {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::plc::codes::REASONS;
     use crate::plc::record;
 
     fn fields_fit<S>(fields: &[Field<S>], end: u16) {
@@ -573,7 +534,7 @@ mod tests {
         status.can.state = CanState::BusOff;
         assert_eq!(status.reason(), 3);
         assert!(status.reasons().eq([3, 6, 11]));
-        let codes = REASONS.iter().map(|(code, _)| *code);
+        let codes = REASONS.iter().map(|(code, ..)| *code);
         assert!(codes.eq(0..26));
     }
 

@@ -57,11 +57,11 @@ pub fn lamps(status: &Status) -> Vec<Lamp> {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::plc::registers::REASONS;
+    use crate::plc::codes::REASONS;
 
     #[test]
     fn every_reason_lights_a_lamp_or_puts_one_out() {
-        for (code, meaning) in REASONS.iter().skip(1) {
+        for (code, _, meaning) in REASONS.iter().skip(1) {
             let known = LAMPS.iter().filter(|(known, _)| known == code).count();
             assert_eq!(known, 1, "{code}: {meaning}");
         }
