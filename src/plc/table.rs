@@ -74,6 +74,31 @@ impl<S> Field<S> {
         }
     }
 
+    /// Whether it stays as it is stored where real numbers have 24 bits, which a belt outruns in a day.
+    pub fn is_whole(&self) -> bool {
+        self.kind == Type::U32 || (self.scale - 1.0).abs() < f64::EPSILON
+    }
+
+    /// Its name with its unit: some bare ones, `time`, are key words.
+    pub fn name_with_unit(&self) -> String {
+        let (name, unit) = (self.name, self.unit.replace('/', "_per_"));
+        match unit.as_str() {
+            "" | "bits" => name.to_owned(),
+            "%" => format!("{name}_percent"),
+            unit if name.starts_with(unit) => name.to_owned(),
+            unit => format!("{name}_{unit}"),
+        }
+    }
+
+    /// The same for the number as it is stored, where it [stays so](Self::is_whole).
+    pub fn name_as_kept(&self) -> String {
+        if self.is_whole() && self.scale > 1.0 {
+            format!("{}_{}_per_{}", self.name, self.scale, self.unit.replace('/', "_per_"))
+        } else {
+            self.name_with_unit()
+        }
+    }
+
     /// Write it into its block of registers.
     pub fn write(&self, source: &S, order: WordOrder, block: &mut [u16]) {
         let (bits, at) = (self.bits(source), usize::from(self.offset));
