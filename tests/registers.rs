@@ -1,6 +1,6 @@
 //! The committed documents of the PLC interface are those of the code.
 
-use beltgauge::plc::{dbc, document, structured_text};
+use beltgauge::plc::{dbc, document, kits, structured_text};
 
 fn is_current(name: &str, current: &str) {
     let path = format!("{}/config/{name}", env!("CARGO_MANIFEST_DIR"));
@@ -28,4 +28,11 @@ fn the_committed_dbc_is_current() {
 #[test]
 fn the_committed_structured_text_is_current() {
     is_current("plc.st", &structured_text::document());
+}
+
+#[test]
+fn the_committed_kits_are_current() {
+    for (name, current) in kits::documents() {
+        is_current(&format!("kits/{name}"), &current);
+    }
 }
