@@ -101,6 +101,15 @@ fn check(decoded: &BTreeMap<String, f64>, lacks: &[&str]) {
     }
 }
 
+/// Whether the language of a kit is there, as it is in the whole run of the tests.
+fn is_there(program: &str) -> bool {
+    let there = Command::new(program).arg("--version").output().is_ok_and(|o| o.status.success());
+    if !there {
+        eprintln!("{program} is not installed: its kit is not run");
+    }
+    there
+}
+
 /// The lines `name value` that a program prints about registers.
 fn ask(program: &mut Command, registers: &[u16]) -> BTreeMap<String, f64> {
     let mut child = program
@@ -135,4 +144,18 @@ fn c_reads_what_the_server_encodes() {
     check(&decoded, &[]);
     let other_order = ask(&mut Command::new(&program), &registers(WordOrder::LowFirst));
     assert!(other_order["is_known"] == 0.0, "the other word order must be noticed");
+}
+
+#[test]
+fn python_reads_what_the_server_encodes() {
+    if !is_there("python3") {
+        return;
+    }
+    let decode = |order| {
+        let script = Path::new(env!("CARGO_MANIFEST_DIR")).join("tests/kits/decode.py");
+        let mut python = Command::new("python3");
+        ask(python.arg(script).arg(folder().join("python")), &registers(order))
+    };
+    check(&decode(WordOrder::HighFirst), &["next_ticket", "ring_address"]);
+    assert!(decode(WordOrder::LowFirst)["is_known"] == 0.0, "the other word order must be noticed");
 }
