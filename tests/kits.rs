@@ -159,3 +159,38 @@ fn python_reads_what_the_server_encodes() {
     check(&decode(WordOrder::HighFirst), &["next_ticket", "ring_address"]);
     assert!(decode(WordOrder::LowFirst)["is_known"] == 0.0, "the other word order must be noticed");
 }
+
+#[test]
+fn the_flow_takes_a_parcel_once_and_acknowledges_it_when_it_is_kept() {
+    if !is_there("node") {
+        return;
+    }
+    let run = |order| {
+        let script = Path::new(env!("CARGO_MANIFEST_DIR")).join("tests/kits/run_flow.js");
+        let mut node = Command::new("node");
+        ask(node.arg(script).arg(folder().join("node-red/flow.json")), &registers(order))
+    };
+    let told = run(WordOrder::HighFirst);
+    let lacks = [
+        "running",
+        "belt_seen_mm_per_s",
+        "light_change_percent",
+        "next_ticket",
+        "is_whole",
+        "by_encoder",
+        "x_now_mm",
+        "ring_address",
+    ];
+    check(&told, &lacks);
+    for (name, expected) in [
+        ("utc", 1.0),
+        ("given twice", 0.0),
+        ("acknowledged before it was taken", 0.0),
+        ("given when it was taken", 0.0),
+        ("acknowledged when it was taken", 1.0),
+    ] {
+        assert!(told[name] == expected, "{name}: {}", told[name]);
+    }
+    let other_order = run(WordOrder::LowFirst);
+    assert!(other_order["is_known"] == 0.0, "the other word order must be noticed");
+}

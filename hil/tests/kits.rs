@@ -3,6 +3,7 @@
 
 use hil::project;
 use hil::server::{Server, record};
+use serde_json::Value;
 use std::net::SocketAddr;
 use std::path::{Path, PathBuf};
 use std::process::{Child, Command, Stdio};
@@ -170,4 +171,46 @@ with kit.Beltgauge('127.0.0.1', int(sys.argv[1])) as gauge:
         .output()
         .expect(".ci/run makes the environment, with pymodbus");
     assert!(output.status.success(), "{}", String::from_utf8_lossy(&output.stderr));
+}
+
+#[test]
+fn node_red_takes_every_parcel_once_over_twenty_restarts() {
+    fn line(line: &str) -> (u32, f64) {
+        let parcel: Value = serde_json::from_str(line).expect("JSON");
+        (
+            parcel["sequence"].as_u64().expect("a number") as u32,
+            parcel["length_mm"].as_f64().expect("mm"),
+        )
+    }
+    let folder = folder("kits-node-red");
+    let file = folder.join("parcels.jsonl");
+    let flow = std::fs::read_to_string(project().join("config/kits/node-red/flow.json"))
+        .expect("committed");
+    let modules = project().join("target/hil-node/node_modules").canonicalize();
+    let modules = modules.expect(".ci/run installs node-red and modbus-serial");
+    // Where Node-RED looks for what function nodes ask for.
+    std::os::unix::fs::symlink(&modules, folder.join("node_modules")).expect("writable");
+    let settings = "module.exports = { uiHost: '127.0.0.1', uiPort: 0, externalModules: { autoInstall: false } };";
+    std::fs::write(folder.join("settings.js"), settings).expect("writable");
+    std::fs::write(
+        folder.join("package.json"),
+        r#"{"name": "flows", "dependencies": {"modbus-serial": "*"}}"#,
+    )
+    .expect("writable");
+    let mut written = take_all("kits-node-red", &file, line, |address| {
+        let flow = flow
+            .replace("192.168.1.10", "127.0.0.1")
+            .replace("\"502\"", &format!("\"{}\"", address.port()));
+        std::fs::write(folder.join("flow.json"), flow).expect("writable");
+        let mut node = Command::new("node");
+        node.arg(modules.join("node-red/red.js")).arg("--userDir").arg(&folder);
+        node.arg("--settings").arg(folder.join("settings.js")).arg(folder.join("flow.json"));
+        node.current_dir(&folder);
+        Client::start(node)
+    });
+    // Killed between writing and acknowledging, it gives the parcel once more, with the same number.
+    let lines = written.len() as u32;
+    written.dedup();
+    assert!(lines <= PARCELS + RESTARTS / CLIENT_EVERY, "{lines} lines");
+    check(&written);
 }

@@ -1,6 +1,7 @@
 //! Kits: what connects a PLC, a PC or a flow to the registers, printed from the tables that encode them.
 
 pub mod c;
+pub mod node_red;
 pub mod python;
 
 use super::codes::{FAULT_BITS, REASONS, STATUS_BITS, VALID_BITS};
@@ -14,7 +15,11 @@ pub const IDENTITY_REGISTERS: u16 = 5;
 
 /// Every kit: its path below `config/kits`, and its text.
 pub fn documents() -> Vec<(&'static str, String)> {
-    vec![("c/beltgauge.h", c::document()), ("python/beltgauge.py", python::document())]
+    vec![
+        ("c/beltgauge.h", c::document()),
+        ("python/beltgauge.py", python::document()),
+        ("node-red/flow.json", node_red::document()),
+    ]
 }
 
 /// The version of the register map.
