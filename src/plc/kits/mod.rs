@@ -2,8 +2,11 @@
 
 pub mod c;
 pub mod node_red;
+pub mod plcopen;
 pub mod python;
+pub mod scl;
 
+use self::plcopen::Edition;
 use super::codes::{FAULT_BITS, REASONS, STATUS_BITS, VALID_BITS};
 use super::command::{COMMANDS, Outcome};
 use super::registers::{MAP_VERSION, STATUS_FIELDS, Status};
@@ -19,6 +22,9 @@ pub fn documents() -> Vec<(&'static str, String)> {
         ("c/beltgauge.h", c::document()),
         ("python/beltgauge.py", python::document()),
         ("node-red/flow.json", node_red::document()),
+        ("plcopen/beltgauge_tc6_0200.xml", plcopen::document(Edition::Tc6V0200)),
+        ("plcopen/beltgauge_tc6_0201.xml", plcopen::document(Edition::Tc6V0201)),
+        ("tia/beltgauge.scl", scl::document()),
     ]
 }
 
