@@ -183,13 +183,13 @@ fn the_flow_takes_a_parcel_once_and_acknowledges_it_when_it_is_kept() {
     ];
     check(&told, &lacks);
     for (name, expected) in [
-        ("utc", 1.0),
-        ("given twice", 0.0),
-        ("acknowledged before it was taken", 0.0),
-        ("given when it was taken", 0.0),
-        ("acknowledged when it was taken", 1.0),
+        ("utc", true),
+        ("given twice", false),
+        ("acknowledged before it was taken", false),
+        ("given when it was taken", false),
+        ("acknowledged when it was taken", true),
     ] {
-        assert!(told[name] == expected, "{name}: {}", told[name]);
+        assert_eq!(told[name] > 0.0, expected, "{name}");
     }
     let other_order = run(WordOrder::LowFirst);
     assert!(other_order["is_known"] == 0.0, "the other word order must be noticed");

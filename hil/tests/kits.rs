@@ -4,6 +4,7 @@
 use hil::project;
 use hil::server::{Server, record};
 use serde_json::Value;
+use std::io::Write;
 use std::net::SocketAddr;
 use std::path::{Path, PathBuf};
 use std::process::{Child, Command, Stdio};
@@ -140,11 +141,27 @@ fn the_python_logger_that_watches_acknowledges_nothing() {
     (1..=10).for_each(|number| server.parcel(number));
     lines(10);
     drop(logger);
+    // What a power cut may leave of a line.
+    let mut torn = std::fs::OpenOptions::new().append(true).open(&file).expect("writable");
+    torn.write_all(b"2026-11-27T12:00:00.000+00:00,11").expect("writable");
     (11..=20).for_each(|number| server.parcel(number));
     let _logger = watch();
     let numbers: Vec<u32> = lines(20).into_iter().map(|(sequence, _)| sequence).collect();
     assert!(numbers.into_iter().eq(1..=20));
     assert_eq!(server.queued(), 20);
+}
+
+#[test]
+fn the_python_logger_leaves_the_files_of_others_alone() {
+    let file = folder("kits-other-file").join("other.csv");
+    for content in ["utc,weight\n", "a note without an end"] {
+        std::fs::write(&file, content).expect("writable");
+        let output = python().args(["beltgauge.py", "127.0.0.1", "--csv"]).arg(&file).output();
+        let output = output.expect(".ci/run makes the environment, with pymodbus");
+        let told = String::from_utf8_lossy(&output.stderr);
+        assert!(!output.status.success() && told.contains("has other columns"), "{told}");
+        assert_eq!(std::fs::read_to_string(&file).expect("still there"), content);
+    }
 }
 
 #[test]
