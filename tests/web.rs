@@ -4,7 +4,9 @@ use beltgauge::config::Web;
 use beltgauge::event::{Flags, NotMeasured, ParcelRecord, Shape};
 use beltgauge::plc::command::COMMANDS;
 use beltgauge::plc::registers::REASONS;
-use beltgauge::web::{self, Archived, Board, Event, Machine, NoPicture, Parcel, Plc, State, View};
+use beltgauge::web::{
+    self, Archived, Board, BundleFile, BundleFiles, Event, Machine, NoPicture, Parcel, Plc, State, View,
+};
 use std::collections::{BTreeMap, BTreeSet};
 use std::io::{ErrorKind, Read, Write};
 use std::net::{SocketAddr, TcpStream};
@@ -33,6 +35,26 @@ impl Machine for Still {
     fn archived_picture(&self, entry: u64) -> Option<Vec<u8>> {
         (entry == 7).then(|| b"jpeg".to_vec())
     }
+    fn bundle(&self) -> BundleFiles {
+        // More than any socket takes on the way.
+        let file = |n| BundleFile { name: format!("{n}.bin"), bytes: Ok(noise(n, 1 << 20)) };
+        Box::new((0..BUNDLED).map(file))
+    }
+}
+
+/// Files of the machine in its bundle.
+const BUNDLED: u32 = 12;
+
+/// Bytes that no packer makes smaller.
+fn noise(seed: u32, bytes: usize) -> Vec<u8> {
+    let mut state = seed + 1;
+    let mut next = || {
+        state ^= state << 13;
+        state ^= state >> 17;
+        state ^= state << 5;
+        state as u8
+    };
+    (0..bytes).map(|_| next()).collect()
 }
 
 struct Server {
@@ -59,6 +81,9 @@ impl Machine for Hung {
     }
     fn archived_picture(&self, entry: u64) -> Option<Vec<u8>> {
         Still.archived_picture(entry)
+    }
+    fn bundle(&self) -> BundleFiles {
+        Still.bundle()
     }
 }
 
@@ -144,6 +169,7 @@ fn what_is_there_is_served_and_every_answer_is_protected() {
         ("/api/archive/8/picture", 404),
         ("/api/archive/x/picture", 404),
         ("/api/parcels.csv", 200),
+        ("/api/bundle.tar.gz?name=../../etc/passwd", 200),
         ("/api/parcels/1/picture", 404),
         ("/api/parcels/-1/picture", 404),
         ("/api/live/up", 404),
@@ -404,6 +430,56 @@ fn the_last_parcels_are_a_table_for_a_spreadsheet() {
         ("version", "1.2.3"),
     ] {
         assert_eq!(cell(name), value, "{name}");
+    }
+}
+
+/// Ask for the bundle and begin to take it; the status that is answered.
+fn begin_bundle(server: &Server) -> (TcpStream, String) {
+    let mut stream = server.connect();
+    stream.write_all(b"GET /api/bundle.tar.gz HTTP/1.0\r\nHost: localhost\r\n\r\n").expect("open");
+    let mut head = [0; 12];
+    stream.read_exact(&mut head).expect("answered");
+    (stream, String::from_utf8_lossy(&head[9..]).into_owned())
+}
+
+#[test]
+fn the_bundle_has_the_files_of_page_and_machine() {
+    let server = Server::start();
+    server.board.parcel(parcel(41), Vec::new());
+    let (mut stream, status) = begin_bundle(&server);
+    let mut answer = Vec::new();
+    stream.read_to_end(&mut answer).expect("whole");
+    let body = answer.windows(4).position(|end| end == b"\r\n\r\n").expect("an answer") + 4;
+    let head = String::from_utf8_lossy(&answer[..body]).into_owned();
+    assert_eq!(status, "200");
+    assert!(head.contains("content-disposition: attachment; filename=\"beltgauge-bundle.tar.gz\""));
+    let mut files = BTreeMap::new();
+    let mut archive = tar::Archive::new(flate2::read::GzDecoder::new(&answer[body..]));
+    for entry in archive.entries().expect("whole") {
+        let mut entry = entry.expect("whole");
+        let (name, mut bytes) = (entry.path().expect("a name").into_owned(), Vec::new());
+        entry.read_to_end(&mut bytes).expect("whole");
+        files.insert(name.strip_prefix("beltgauge-bundle").expect("inside").to_owned(), bytes);
+    }
+    let text = |name: &str| String::from_utf8_lossy(&files[Path::new(name)]).into_owned();
+    assert!(text("state.json").contains("1.2.3") && text("plc.json").contains("map_version"));
+    assert!(text("parcels.csv").contains(",41,235.1,") && text("events.json") == "[]");
+    assert_eq!(files[Path::new("11.bin")], noise(11, 1 << 20));
+    assert_eq!(text("contents.txt").lines().count(), 4 + BUNDLED as usize);
+}
+
+#[test]
+fn who_is_slow_to_take_the_bundle_holds_nobody_up_and_few_are_made_at_once() {
+    let server = Server::start();
+    let mut slow: Vec<(TcpStream, String)> = (0..4).map(|_| begin_bundle(&server)).collect();
+    assert!(slow.iter().all(|(_, status)| status == "200"));
+    // There are fewer readers than slow visitors.
+    assert_eq!(status(&server.get("/api/archive?limit=1")), 200);
+    assert_eq!(begin_bundle(&server).1, "503");
+    slow.pop();
+    let start = Instant::now();
+    while begin_bundle(&server).1 != "200" {
+        assert!(start.elapsed() < PATIENCE, "its place is not given back");
     }
 }
 

@@ -14,6 +14,14 @@ pub struct Stored {
     pub entry: Entry,
 }
 
+impl Stored {
+    /// As a line of JSON, without the picture.
+    pub fn json(&self) -> String {
+        let (number, kind, what) = (self.number, self.entry.kind.name(), &self.entry.text);
+        format!("{{\"entry\":{number},\"kind\":\"{kind}\",\"what\":{what}}}")
+    }
+}
+
 /// What [`Reader::verify`] found.
 #[derive(Clone, Debug, Default, PartialEq, Eq)]
 pub struct Verdict {

@@ -95,9 +95,7 @@ pub fn export(folder: &Path, to: Export<'_>) -> Result<String> {
             csv.write(&columns::line(stored.number, stored.entry.utc_ms, &record))?;
         }
         if let Some(jsonl) = &mut jsonl {
-            let (number, kind) = (stored.number, stored.entry.kind.name());
-            let what = &stored.entry.text;
-            jsonl.write(&format!("{{\"entry\":{number},\"kind\":\"{kind}\",\"what\":{what}}}"))?;
+            jsonl.write(&stored.json())?;
         }
         if let Some(folder) = to.pictures.filter(|_| !stored.entry.picture.is_empty()) {
             let path = folder.join(format!("{:08}.jpg", stored.number));

@@ -12,6 +12,7 @@
 mod api;
 mod assets;
 mod board;
+mod bundle;
 mod guard;
 mod metrics;
 mod model;
@@ -19,7 +20,7 @@ mod server;
 
 pub use board::{Board, Picture, View};
 pub use model::{
-    ArchiveState, Archived, BeltState, CameraState, Client, Counts, Cuboid, Event, Field, Lamp,
+    ArchiveState, Archived, BeltState, BundleFile, BundleFiles, CameraState, Client, Counts, Cuboid, Event, Field, Lamp,
     Machine, NoPicture, Parcel, ParcelPicture, Plc, Scene, Sight, State, Written,
 };
 pub use server::{Listening, listen, serve};

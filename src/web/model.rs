@@ -20,6 +20,21 @@ pub trait Machine: Send + Sync + 'static {
     fn archived(&self, before: Option<u64>, limit: usize) -> Result<Archived, String>;
     /// The picture of an entry of the archive. May wait for the disk.
     fn archived_picture(&self, entry: u64) -> Option<Vec<u8>>;
+    /// What it adds to the support bundle: each file is made when it is asked for, and may wait for the
+    /// disk.
+    fn bundle(&self) -> BundleFiles;
+}
+
+/// Files of the support bundle, one after the other.
+pub type BundleFiles = Box<dyn Iterator<Item = BundleFile> + Send>;
+
+/// A file of the support bundle.
+#[derive(Clone, Debug)]
+pub struct BundleFile {
+    /// Its path in the bundle.
+    pub name: String,
+    /// What is in it, or why it is left out.
+    pub bytes: Result<Vec<u8>, String>,
 }
 
 /// The machine's state.

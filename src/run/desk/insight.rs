@@ -1,5 +1,6 @@
 //! What the page asks of the machine, from what its threads have told last.
 
+use super::bundle::{self, Papers};
 use super::lamps::lamps;
 use crate::archive::{Condition, Reader, Stored};
 use crate::config::{Config, WordOrder};
@@ -36,6 +37,7 @@ pub struct PlcSide {
 /// What is known, for whoever asks.
 pub struct Insight {
     config: Config,
+    papers: Papers,
     image_size_px: [usize; 2],
     started: Instant,
     plc: Mutex<PlcSide>,
@@ -70,10 +72,16 @@ pub fn utc_ms() -> u64 {
 
 impl Insight {
     /// Nothing is known yet.
-    pub fn new(config: Config, image_size_px: [usize; 2], clients_max: usize) -> Self {
+    pub fn new(
+        config: Config,
+        papers: Papers,
+        image_size_px: [usize; 2],
+        clients_max: usize,
+    ) -> Self {
         let status = Status::default();
         Self {
             config,
+            papers,
             image_size_px,
             started: Instant::now(),
             plc: Mutex::new(PlcSide {
@@ -258,6 +266,10 @@ impl web::Machine for Insight {
         let picture = reader.entry(entry).ok()??.entry.picture;
         (!picture.is_empty()).then_some(picture)
     }
+
+    fn bundle(&self) -> web::BundleFiles {
+        bundle::files(&self.config, &self.papers)
+    }
 }
 
 /// The values of a block, read back from the registers: what the PLC sees, and nothing else.
@@ -298,11 +310,16 @@ pub mod tests {
     use crate::plc::registers::RegisterImage;
     use crate::web::Machine;
 
-    /// Of a plain configuration.
-    pub fn insight() -> Insight {
+    /// A plain configuration.
+    pub fn config() -> Config {
         let config = "[camera]\ncalibration = \"c\"\n[belt]\nspeed_mm_per_s = 500\n\
             [zone]\nx_min_mm = -600\nx_max_mm = 600\ny_min_mm = -380\ny_max_mm = 380\n";
-        Insight::new(Config::parse(config).expect("valid"), [0; 2], 4)
+        Config::parse(config).expect("valid")
+    }
+
+    /// Of a plain configuration.
+    pub fn insight() -> Insight {
+        Insight::new(config(), Papers::default(), [0; 2], 4)
     }
 
     #[test]

@@ -7,12 +7,14 @@
 //! PLC thread -> [published records] --^
 //! ```
 
+mod bundle;
 mod insight;
 mod lamps;
 mod news;
 mod scene;
 pub mod shots;
 
+pub use bundle::Papers;
 pub use insight::{Insight, is_due};
 pub use shots::{Album, Photographer, Rings, Shot};
 
