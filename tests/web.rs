@@ -30,7 +30,7 @@ impl Machine for Still {
     fn archived(&self, before: Option<u64>, limit: usize) -> Result<Archived, String> {
         let last = before.unwrap_or(1000);
         let entries = (0..limit as u64).map(|i| serde_json::json!(last - 1 - i)).collect();
-        Ok(Archived { entries, before: Some(last - limit as u64) })
+        Ok(Archived { entries, before: Some(last - limit as u64), unread: Vec::new() })
     }
     fn archived_picture(&self, entry: u64) -> Option<Vec<u8>> {
         (entry == 7).then(|| b"jpeg".to_vec())

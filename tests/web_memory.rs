@@ -55,7 +55,8 @@ impl Machine for Still {
         Plc::default()
     }
     fn archived(&self, _: Option<u64>, limit: usize) -> Result<Archived, String> {
-        Ok(Archived { entries: vec![serde_json::json!({"seq": 1}); limit], before: None })
+        let entries = vec![serde_json::json!({"seq": 1}); limit];
+        Ok(Archived { entries, ..Archived::default() })
     }
     fn archived_picture(&self, _: u64) -> Option<Vec<u8>> {
         Some(vec![0; 20_000])

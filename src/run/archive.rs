@@ -19,10 +19,11 @@ pub struct Export<'a> {
     pub pictures: Option<&'a Path>,
 }
 
-/// The last entries, newest first.
+/// The last entries, newest first, and what of them cannot be read.
 pub fn list(folder: &Path, last: usize) -> Result<String> {
     let mut text = String::new();
-    for stored in Reader::open(folder)?.before(None, last)? {
+    let page = Reader::open(folder)?.before(None, last)?;
+    for stored in page.entries {
         // Writing to a string does not fail.
         let _ = writeln!(
             text,
@@ -31,6 +32,9 @@ pub fn list(folder: &Path, last: usize) -> Result<String> {
             columns::utc(stored.entry.utc_ms),
             line(&stored)
         );
+    }
+    for unread in page.unread {
+        let _ = writeln!(text, "warning: {unread}");
     }
     Ok(text)
 }

@@ -236,6 +236,8 @@ pub struct Archived {
     pub entries: Vec<serde_json::Value>,
     /// Ask for what is before this one; none: there is no more.
     pub before: Option<u64>,
+    /// Where entries are missing among these because they cannot be read.
+    pub unread: Vec<String>,
 }
 
 /// The PLC's side.

@@ -10,6 +10,7 @@ use crate::error::{Error, Result};
 use crate::run::memory;
 use crate::store::files;
 use crate::web::{BundleFile, BundleFiles};
+use std::collections::BTreeSet;
 use std::path::{Path, PathBuf};
 
 /// A file on the disk that is larger is left out.
@@ -124,12 +125,15 @@ struct Noted {
     events_count: usize,
     /// Entries of parcels that must not be used.
     numbers: Vec<u64>,
+    /// Each once, however many pages tell it.
+    unread: BTreeSet<String>,
 }
 
 fn archived(folder: PathBuf) -> BundleFiles {
     match noted(&folder) {
         Err(e) => Box::new(std::iter::once(file("archive", Err(e.to_string())))),
-        Ok(Noted { events, doubted, numbers, .. }) => {
+        Ok(Noted { events, doubted, numbers, unread, .. }) => {
+            let unread = unread.into_iter().map(|why| file("archive", Err(why)));
             let lists = [("events", events), ("doubted", doubted)];
             let lists =
                 lists.map(|(name, text)| file(&format!("archive/{name}.jsonl"), Ok(text.into())));
@@ -137,7 +141,7 @@ fn archived(folder: PathBuf) -> BundleFiles {
                 let picture = picture(&folder, number);
                 file(&format!("archive/{number:08}.jpg"), picture)
             });
-            Box::new(lists.into_iter().chain(pictures))
+            Box::new(lists.into_iter().chain(unread).chain(pictures))
         }
     }
 }
@@ -147,9 +151,10 @@ fn noted(folder: &Path) -> Result<Noted> {
     let (mut noted, mut before) = (Noted::default(), None);
     for _ in 0..ENTRIES_MAX / PAGE {
         let page = reader.before(before, PAGE)?;
-        page.iter().for_each(|stored| noted.take(stored));
-        before = page.last().map(|oldest| oldest.number);
-        if page.len() < PAGE {
+        page.entries.iter().for_each(|stored| noted.take(stored));
+        noted.unread.extend(page.unread);
+        before = page.entries.last().map(|oldest| oldest.number);
+        if page.entries.len() < PAGE {
             break;
         }
     }
@@ -188,6 +193,8 @@ fn picture(folder: &Path, number: u64) -> std::result::Result<Vec<u8>, String> {
 mod tests {
     use super::*;
     use crate::archive::{Archive, Entry};
+    use crate::run::desk::Insight;
+    use crate::web::Machine;
     use std::collections::BTreeMap;
     use std::fs;
     use std::time::Duration;
@@ -278,6 +285,22 @@ mod tests {
         assert_eq!(pictures, DOUBTED_MAX);
         assert!(found.contains_key("archive/00000600.jpg"), "the newest");
         assert_eq!(found["archive/00000600.jpg"].as_deref(), Ok(&b"jpeg 299"[..]));
+        let _ = fs::remove_dir_all(folder);
+    }
+
+    #[test]
+    fn what_cannot_be_read_of_the_archive_is_told_on_the_page_and_in_the_bundle() {
+        let (folder, config) = site("unread", vec![event(1)]);
+        // A folder opens and cannot be read, as a file on a bad sector.
+        fs::create_dir(folder.join("archive/00000000000000000009.bga")).expect("room");
+        let found = by_name(files(&config, &Papers::default()));
+        let is_told = |why: &String| why.starts_with("00000000000000000009.bga: cannot be read");
+        assert!(found["archive"].as_ref().is_err_and(is_told), "{found:?}");
+        assert!(found["archive/events.jsonl"].as_ref().is_ok_and(|text| !text.is_empty()));
+        let insight = Insight::new(config, Papers::default(), [0; 2], 4);
+        let archived = insight.archived(None, 9).expect("the rest");
+        assert!(archived.entries.len() == 1 && archived.unread.iter().all(is_told));
+        assert_eq!(archived.unread.len(), 1);
         let _ = fs::remove_dir_all(folder);
     }
 

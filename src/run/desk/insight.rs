@@ -2,7 +2,7 @@
 
 use super::bundle::{self, Papers};
 use super::lamps::lamps;
-use crate::archive::{Condition, Reader, Stored};
+use crate::archive::{Condition, Page, Reader, Stored};
 use crate::config::{Config, WordOrder};
 use crate::plc::clients::{Client, ClientList};
 use crate::plc::command::Sender;
@@ -243,8 +243,8 @@ impl web::Machine for Insight {
 
     fn archived(&self, before: Option<u64>, limit: usize) -> Result<web::Archived, String> {
         let reader = Reader::open(self.archive_folder()?).map_err(|e| e.to_string())?;
-        let stored = reader.before(before, limit).map_err(|e| e.to_string())?;
-        let last = stored.last().map(|stored| stored.number);
+        let Page { entries, unread } = reader.before(before, limit).map_err(|e| e.to_string())?;
+        let last = entries.last().map(|stored| stored.number);
         let entry = |stored: Stored| {
             let what: serde_json::Value =
                 serde_json::from_str(&stored.entry.text).unwrap_or_default();
@@ -256,8 +256,9 @@ impl web::Machine for Insight {
             })
         };
         Ok(web::Archived {
-            before: last.filter(|_| stored.len() == limit),
-            entries: stored.into_iter().map(entry).collect(),
+            before: last.filter(|_| entries.len() == limit),
+            entries: entries.into_iter().map(entry).collect(),
+            unread,
         })
     }
 
