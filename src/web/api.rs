@@ -5,7 +5,7 @@ use super::board::{Board, PARCELS_MAX, View};
 use super::bundle::{self, Packing};
 use super::guard::{self, Hosts};
 use super::metrics;
-use super::model::{Archived, BundleFile, Event, Machine, Parcel};
+use super::model::{Archived, BundleFile, Event, Machine, Parcel, Point};
 use crate::config::Web as Settings;
 use crate::event::csv;
 use axum::body::Body;
@@ -16,6 +16,7 @@ use axum::response::{IntoResponse, Response};
 use axum::routing::get;
 use axum::{Json, Router};
 use serde::Serialize;
+use std::borrow::Borrow;
 use std::sync::Arc;
 use std::time::Duration;
 use tokio::sync::Semaphore;
@@ -24,6 +25,8 @@ use tokio::sync::Semaphore;
 const PICTURE_PATIENCE: Duration = Duration::from_secs(1);
 /// Entries of the archive in one answer.
 const ARCHIVED_MAX: usize = 100;
+/// Pieces of the trend in one answer; a page asks until there are no more.
+const POINTS_MAX: usize = 500;
 /// Support bundles that are made at once: each holds a file and the packer's tables, about 2 MB.
 const BUNDLES_MAX: usize = 4;
 /// A number in a query has no more digits.
@@ -63,6 +66,7 @@ pub(super) fn router(board: Arc<Board>, machine: Arc<dyn Machine>, settings: &Se
         .route("/api/parcels.csv", get(parcels_csv))
         .route("/api/parcels/{n}/picture", get(parcel_picture))
         .route("/api/events", get(events))
+        .route("/api/trend", get(trend))
         .route("/api/live/{view}", get(live))
         .route("/api/archive", get(archive))
         .route("/api/archive/{entry}/picture", get(archive_picture))
@@ -148,12 +152,12 @@ struct Listed<'a, T> {
 
 fn listed<T: Serialize>(
     board: &Board,
-    items: &[Arc<T>],
+    items: &[impl Borrow<T>],
     since: u64,
     n: impl Fn(&T) -> u64,
 ) -> Response {
-    let next = items.last().map_or(since, |item| n(item));
-    let items = items.iter().map(|item| &**item).collect();
+    let next = items.last().map_or(since, |item| n(item.borrow()));
+    let items = items.iter().map(Borrow::borrow).collect();
     Json(Listed { run: board.started_ms(), items, next }).into_response()
 }
 
@@ -226,6 +230,15 @@ async fn events(
     let since = number(query.as_deref(), "since")?.unwrap_or(0);
     let items = from.board.events_since(since);
     Ok(listed(&from.board, &items, since, |event: &Event| event.n))
+}
+
+async fn trend(
+    State(from): State<Sources>,
+    RawQuery(query): RawQuery,
+) -> Result<Response, Response> {
+    let since = number(query.as_deref(), "since")?.unwrap_or(0);
+    let points = from.board.points_since(since, POINTS_MAX);
+    Ok(listed(&from.board, &points, since, |point: &Point| point.n))
 }
 
 async fn parcel_picture(State(from): State<Sources>, Path(n): Path<String>) -> Response {

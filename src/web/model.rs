@@ -229,6 +229,31 @@ pub struct Event {
     pub detail: String,
 }
 
+/// A piece of the trend: what happened meanwhile.
+#[derive(Clone, Copy, Debug, Default, Serialize)]
+pub struct Point {
+    /// Its number, from 1 at start.
+    pub n: u64,
+    /// When it ended, ms since 1970.
+    pub utc_ms: u64,
+    /// How long it is.
+    pub span_s: f32,
+    /// Parcels told.
+    pub parcels: u32,
+    /// Of these, parcels whose dimensions must not be used, measured or not.
+    pub refused: u32,
+    /// Of these, parcels that could not be measured.
+    pub unmeasured: u32,
+    /// Means of the standard deviations of length, width and height of those that were measured.
+    pub sigma_mm: Option<[f32; 3]>,
+    /// The belt's speed at its end; `None`: not measured.
+    pub belt_speed_mm_per_s: Option<f32>,
+    /// Standard deviation of the picture's blur at its end; `None`: not known.
+    pub blur_px: Option<f32>,
+    /// Frames that came too late, torn or not at all.
+    pub frames_missing: u32,
+}
+
 /// Entries of the archive.
 #[derive(Clone, Debug, Default, Serialize)]
 pub struct Archived {
