@@ -101,7 +101,7 @@ fn dispatch(command: Command) -> Result<()> {
                 annotate: annotate.as_deref(),
                 explain: explain.as_deref(),
             };
-            let camera = config.with_file_name(&site.config.camera.calibration);
+            let camera = site.config.camera.calibration.clone();
             outputs.refuse_inputs(&[&input, &config, &camera])?;
             let faults = inject.as_deref().map(Faults::parse).transpose()?;
             let source = source::open(&input, fps)?;
@@ -197,7 +197,7 @@ fn print_budget(what: &Budget) -> Result<()> {
     let site = match what {
         Budget { config: Some(config), .. } => {
             let site = Site::load(config)?;
-            let camera = config.with_file_name(&site.config.camera.calibration);
+            let camera = site.config.camera.calibration.clone();
             if let Some(out) = &what.out {
                 refuse_inputs("--out", out, &[config, &camera])?;
             }

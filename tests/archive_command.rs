@@ -92,5 +92,13 @@ fn a_changed_archive_fails_and_an_export_into_it_is_refused() {
     let verified = archive(&["verify"], &inside);
     assert_eq!(verified.status.code(), Some(1));
     assert!(text(&verified.stderr).contains("entry 2 was changed"), "{}", text(&verified.stderr));
+    // What cannot be read any more is missing from the list, and the list says so.
+    let head = bytes[..at].windows(4).rposition(|w| w == b"BGEN").expect("the entry's head");
+    bytes[head] = b'X';
+    fs::write(&segment, &bytes).expect("room");
+    let listed = text(&archive(&["list"], &inside).stdout);
+    let lines: Vec<&str> = listed.lines().collect();
+    assert!(lines.len() == 2 && lines[0].contains("started"), "{listed}");
+    assert_eq!(lines[1], "warning: 00000000000000000001.bga: damaged where entry 2 should be");
     assert_eq!(archive(&["list"], &folder.join("nowhere")).status.code(), Some(2));
 }

@@ -8,7 +8,7 @@ use beltgauge::image::FrameTime;
 use beltgauge::run::{Appliance, demo, end_on_panic};
 use beltgauge::source::synthetic::Synthetic;
 use beltgauge::source::{FrameSource, Pace, Paced};
-use beltgauge::web::{self, Archived, Board, Machine, Plc, State};
+use beltgauge::web::{self, Archived, Board, BundleFiles, Machine, Plc, State};
 use std::io::{Read, Write};
 use std::process::{Command, Stdio};
 use std::sync::Arc;
@@ -94,6 +94,9 @@ impl Machine for Panicking {
     }
     fn archived_picture(&self, _: u64) -> Option<Vec<u8>> {
         None
+    }
+    fn bundle(&self) -> BundleFiles {
+        Box::new(std::iter::empty())
     }
 }
 

@@ -1,11 +1,12 @@
-//! The page's server as strangers meet it, and the page's texts.
+//! The page's server as strangers meet it.
 
 use beltgauge::config::Web;
-use beltgauge::event::{Flags, NotMeasured, ParcelRecord, Shape};
-use beltgauge::plc::codes::REASONS;
-use beltgauge::plc::command::COMMANDS;
-use beltgauge::web::{self, Archived, Board, Event, Machine, NoPicture, Parcel, Plc, State, View};
-use std::collections::{BTreeMap, BTreeSet};
+use beltgauge::event::{Flags, ParcelRecord, Shape};
+use beltgauge::web::{
+    self, Archived, Board, BundleFile, BundleFiles, Event, Machine, NoPicture, Parcel, Plc, Point,
+    State, View,
+};
+use std::collections::BTreeMap;
 use std::io::{ErrorKind, Read, Write};
 use std::net::{SocketAddr, TcpStream};
 use std::path::Path;
@@ -28,11 +29,31 @@ impl Machine for Still {
     fn archived(&self, before: Option<u64>, limit: usize) -> Result<Archived, String> {
         let last = before.unwrap_or(1000);
         let entries = (0..limit as u64).map(|i| serde_json::json!(last - 1 - i)).collect();
-        Ok(Archived { entries, before: Some(last - limit as u64) })
+        Ok(Archived { entries, before: Some(last - limit as u64), unread: Vec::new() })
     }
     fn archived_picture(&self, entry: u64) -> Option<Vec<u8>> {
         (entry == 7).then(|| b"jpeg".to_vec())
     }
+    fn bundle(&self) -> BundleFiles {
+        // More than any socket takes on the way.
+        let file = |n| BundleFile { name: format!("{n}.bin"), bytes: Ok(noise(n, 1 << 20)) };
+        Box::new((0..BUNDLED).map(file))
+    }
+}
+
+/// Files of the machine in its bundle.
+const BUNDLED: u32 = 12;
+
+/// Bytes that no packer makes smaller.
+fn noise(seed: u32, bytes: usize) -> Vec<u8> {
+    let mut state = seed + 1;
+    let mut next = || {
+        state ^= state << 13;
+        state ^= state >> 17;
+        state ^= state << 5;
+        state as u8
+    };
+    (0..bytes).map(|_| next()).collect()
 }
 
 struct Server {
@@ -59,6 +80,9 @@ impl Machine for Hung {
     }
     fn archived_picture(&self, entry: u64) -> Option<Vec<u8>> {
         Still.archived_picture(entry)
+    }
+    fn bundle(&self) -> BundleFiles {
+        Still.bundle()
     }
 }
 
@@ -144,6 +168,8 @@ fn what_is_there_is_served_and_every_answer_is_protected() {
         ("/api/archive/8/picture", 404),
         ("/api/archive/x/picture", 404),
         ("/api/parcels.csv", 200),
+        ("/api/trend?since=4", 200),
+        ("/api/bundle.tar.gz?name=../../etc/passwd", 200),
         ("/api/parcels/1/picture", 404),
         ("/api/parcels/-1/picture", 404),
         ("/api/live/up", 404),
@@ -407,6 +433,74 @@ fn the_last_parcels_are_a_table_for_a_spreadsheet() {
     }
 }
 
+/// Ask for the bundle and begin to take it; the status that is answered.
+fn begin_bundle(server: &Server) -> (TcpStream, String) {
+    let mut stream = server.connect();
+    stream.write_all(b"GET /api/bundle.tar.gz HTTP/1.0\r\nHost: localhost\r\n\r\n").expect("open");
+    let mut head = [0; 12];
+    stream.read_exact(&mut head).expect("answered");
+    (stream, String::from_utf8_lossy(&head[9..]).into_owned())
+}
+
+#[test]
+fn the_bundle_has_the_files_of_page_and_machine() {
+    let server = Server::start();
+    server.board.parcel(parcel(41), Vec::new());
+    let (mut stream, status) = begin_bundle(&server);
+    let mut answer = Vec::new();
+    stream.read_to_end(&mut answer).expect("whole");
+    let body = answer.windows(4).position(|end| end == b"\r\n\r\n").expect("an answer") + 4;
+    let head = String::from_utf8_lossy(&answer[..body]).into_owned();
+    assert_eq!(status, "200");
+    assert!(head.contains("content-disposition: attachment; filename=\"beltgauge-bundle.tar.gz\""));
+    let mut files = BTreeMap::new();
+    let mut archive = tar::Archive::new(flate2::read::GzDecoder::new(&answer[body..]));
+    for entry in archive.entries().expect("whole") {
+        let mut entry = entry.expect("whole");
+        let (name, mut bytes) = (entry.path().expect("a name").into_owned(), Vec::new());
+        entry.read_to_end(&mut bytes).expect("whole");
+        files.insert(name.strip_prefix("beltgauge-bundle").expect("inside").to_owned(), bytes);
+    }
+    let text = |name: &str| String::from_utf8_lossy(&files[Path::new(name)]).into_owned();
+    assert!(text("state.json").contains("1.2.3") && text("plc.json").contains("map_version"));
+    assert!(text("parcels.csv").contains(",41,235.1,") && text("events.json") == "[]");
+    assert_eq!(files[Path::new("11.bin")], noise(11, 1 << 20));
+    assert_eq!(text("contents.txt").lines().count(), 4 + BUNDLED as usize);
+}
+
+#[test]
+fn who_is_slow_to_take_the_bundle_holds_nobody_up_and_few_are_made_at_once() {
+    let server = Server::start();
+    let mut slow: Vec<(TcpStream, String)> = (0..4).map(|_| begin_bundle(&server)).collect();
+    assert!(slow.iter().all(|(_, status)| status == "200"));
+    // There are fewer readers than slow visitors.
+    assert_eq!(status(&server.get("/api/archive?limit=1")), 200);
+    assert_eq!(begin_bundle(&server).1, "503");
+    slow.pop();
+    let start = Instant::now();
+    while begin_bundle(&server).1 != "200" {
+        assert!(start.elapsed() < PATIENCE, "its place is not given back");
+    }
+}
+
+#[test]
+fn the_trend_is_taken_in_pieces_until_there_is_no_more() {
+    let server = Server::start();
+    for parcels in 0..1200 {
+        server.board.point(Point { parcels, ..Point::default() });
+    }
+    let (mut since, mut lengths, mut parcels) = (0, Vec::new(), Vec::new());
+    while lengths.last() != Some(&0) {
+        let part = body(&server.get(&format!("/api/trend?since={since}")));
+        let items = part["items"].as_array().expect("a list");
+        parcels.extend(items.iter().map(|point| point["parcels"].as_u64().expect("a number")));
+        lengths.push(items.len());
+        since = part["next"].as_u64().expect("a number");
+    }
+    assert_eq!(lengths, [500, 500, 200, 0]);
+    assert!(parcels.into_iter().eq(0..1200));
+}
+
 #[test]
 fn strange_words_stay_words() {
     let server = Server::start();
@@ -416,76 +510,6 @@ fn strange_words_stay_words() {
     let answer = server.get("/api/events");
     assert!(answer.contains("content-type: application/json"), "never taken for a page");
     assert_eq!(body(&answer)["items"][0]["detail"], detail);
-}
-
-fn page(name: &str) -> String {
-    let path = Path::new(env!("CARGO_MANIFEST_DIR")).join("src/web/page").join(name);
-    std::fs::read_to_string(path).expect("committed")
-}
-
-const SCRIPTS: [&str; 7] =
-    ["main.js", "common.js", "live.js", "overview.js", "parcels.js", "plc.js", "events.js"];
-
-#[test]
-fn the_page_makes_no_markup_from_words_and_fetches_nothing_from_elsewhere() {
-    for name in SCRIPTS {
-        let text = page(name);
-        for word in
-            ["innerHTML", "outerHTML", "insertAdjacentHTML", "document.write", "eval(", "Function("]
-        {
-            assert!(!text.contains(word), "{name} has {word}");
-        }
-        let elsewhere = text.replace("http://www.w3.org/2000/svg", "");
-        assert!(!elsewhere.contains("http:") && !elsewhere.contains("https:"), "{name}");
-    }
-    let html = page("index.html");
-    for word in ["http:", "https:", "style=", "<style", "onclick", "javascript:", "<script>"] {
-        assert!(!html.contains(word), "index.html has {word}");
-    }
-}
-
-#[test]
-fn every_word_is_there_in_both_languages() {
-    let texts = |name: &str| -> BTreeMap<String, String> {
-        serde_json::from_str(&page(name)).expect("texts")
-    };
-    let (english, german) = (texts("en.json"), texts("de.json"));
-    assert!(english.keys().eq(german.keys()), "the same keys");
-    let mut needed: BTreeSet<String> = BTreeSet::new();
-    needed.extend(Flags::ALL.iter().map(|(_, name, _)| format!("flag.{name}")));
-    needed.extend(NotMeasured::ALL.iter().map(|(_, name, _)| format!("not_measured.{name}")));
-    needed.extend(COMMANDS.iter().map(|(code, ..)| format!("command.{code}")));
-    for (code, ..) in REASONS {
-        needed.extend([format!("reason.{code}"), format!("remedy.{code}")]);
-    }
-    for why in NoPicture::ALL {
-        let name = serde_json::to_value(why).expect("a word");
-        needed.insert(format!("no_picture.{}", name.as_str().expect("a word")));
-    }
-    for kind in ["started", "stopped", "began", "ended", "camera_lost", "command", "import"] {
-        needed.insert(format!("event.{kind}"));
-    }
-    for name in SCRIPTS {
-        let script = page(name);
-        for (at, _) in script.match_indices("t(\"") {
-            // Not the end of another function's name.
-            if !script[..at].ends_with(|c: char| c.is_alphanumeric()) {
-                needed.extend(script[at + 3..].split('"').next().map(str::to_owned));
-            }
-        }
-    }
-    assert!(needed.len() > 100, "only {} were found", needed.len());
-    for key in &needed {
-        assert!(english.contains_key(key), "{key} has no text");
-    }
-    // What is replaced in one language is replaced in the other.
-    let places = |text: &str| -> BTreeSet<String> {
-        text.split('{').skip(1).filter_map(|t| t.split('}').next()).map(str::to_owned).collect()
-    };
-    for (key, text) in &english {
-        assert_eq!(places(text), places(&german[key]), "{key}");
-        assert!(!text.is_empty() && !german[key].is_empty(), "{key}");
-    }
 }
 
 #[test]

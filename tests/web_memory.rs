@@ -2,7 +2,9 @@
 #![allow(unsafe_code)] // a counting allocator cannot be written without
 
 use beltgauge::config::Web;
-use beltgauge::web::{self, Archived, Board, Event, Machine, Plc, State, View};
+use beltgauge::web::{
+    self, Archived, Board, BundleFile, BundleFiles, Event, Machine, Plc, State, View,
+};
 use std::alloc::{GlobalAlloc, Layout, System};
 use std::io::{Read, Write};
 use std::net::{SocketAddr, TcpStream};
@@ -35,7 +37,7 @@ const PATIENCE: Duration = Duration::from_secs(30);
 const REQUESTS: usize = 10_000;
 /// Less than one byte for two requests: nothing that is kept for each is so small.
 const STEPS_BYTES: usize = REQUESTS / 2;
-/// What a careless answer leaves behind, for two of eleven requests: a pointer.
+/// What a careless answer leaves behind, for three of twelve requests: a pointer.
 const LEFT_BYTES: usize = 8;
 
 struct Still {
@@ -53,10 +55,15 @@ impl Machine for Still {
         Plc::default()
     }
     fn archived(&self, _: Option<u64>, limit: usize) -> Result<Archived, String> {
-        Ok(Archived { entries: vec![serde_json::json!({"seq": 1}); limit], before: None })
+        let entries = vec![serde_json::json!({"seq": 1}); limit];
+        Ok(Archived { entries, ..Archived::default() })
     }
     fn archived_picture(&self, _: u64) -> Option<Vec<u8>> {
         Some(vec![0; 20_000])
+    }
+    fn bundle(&self) -> BundleFiles {
+        let file = |n| BundleFile { name: format!("{n}"), bytes: Ok(vec![0; 10_000]) };
+        Box::new((0..3).map(file))
     }
 }
 
@@ -79,6 +86,7 @@ fn visit(server: SocketAddr, board: &Board, count: usize) {
         format!("GET /api/live/belt HTTP/1.1\r\n{head}\r\n"),
         format!("GET /api/archive?limit=3 HTTP/1.1\r\n{head}\r\n"),
         format!("GET /api/archive/1/picture HTTP/1.1\r\n{head}\r\n"),
+        format!("GET /api/bundle.tar.gz HTTP/1.1\r\n{head}\r\n"),
         format!("GET /metrics HTTP/1.1\r\n{head}\r\n"),
         format!("GET /{long} HTTP/1.1\r\n{head}\r\n"),
         "GET / HTTP/1.1\r\nHost: evil.example.com\r\nConnection: close\r\n\r\n".to_owned(),

@@ -392,7 +392,7 @@ fn last_seq(folder: &Path) -> u32 {
     let newest = Reader::open(folder).and_then(|reader| reader.before(None, 50));
     let seq = |text: &str| serde_json::from_str::<Value>(text).ok()?["seq"].as_u64();
     let newest = newest.unwrap_or_default();
-    newest.iter().find_map(|stored| seq(&stored.entry.text)).unwrap_or(0) as u32
+    newest.entries.iter().find_map(|stored| seq(&stored.entry.text)).unwrap_or(0) as u32
 }
 
 /// A parcel whose length and width tell its number.

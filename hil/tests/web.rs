@@ -2,7 +2,7 @@
 
 use hil::Demo;
 use hil::browser::Browser;
-use serde_json::Value;
+use serde_json::{Value, json};
 
 /// A thing on the page that is there and shows something.
 const TEXT: &str = "return document.querySelector('main').innerText.length > 50";
@@ -44,12 +44,22 @@ async fn the_page_shows_pictures_and_parcels_in_both_languages_and_its_console_i
         // What the register map says of itself names keys of the configuration.
         let key = "const page = document.body.cloneNode(true);
             page.querySelectorAll('.meaning, code').forEach((cell) => cell.remove());
-            return /\\b(page|lamp|parcel|plc|event|figure|live|reason)\\.[a-z_0-9]+/.exec(page.textContent)?.[0] ?? null";
+            return /(?<!-)\\b(page|lamp|parcel|plc|event|bundle|figure|live|reason)\\.[a-z_0-9]+/.exec(page.textContent)?.[0] ?? null";
         assert_eq!(browser.run(key).await, Value::Null, "a text is missing on {name}");
     }
     let registers = "return document.querySelector('main').innerText.includes('sigma_length')";
     browser.run("location.hash = '#plc'").await;
     browser.wait("registers", registers).await;
+
+    // Charts, as soon as there is something to draw, and a parcel has been told.
+    browser.run("location.hash = '#trend'").await;
+    let drawn = "const charts = [...document.querySelectorAll('.chart')];
+        return charts.length === 6 && charts.every((chart) => chart.querySelector('canvas')?.width > 100)
+            && /\\d/.test(charts[0].getAttribute('aria-label')) && /\\d/.test(charts[2].getAttribute('aria-label'))";
+    browser.wait("charts", drawn).await;
+    browser.screenshot(&shot("trend")).await;
+    let key = "return /\\btrend\\.[a-z_]+/.exec(document.body.textContent)?.[0] ?? null";
+    assert_eq!(browser.run(key).await, Value::Null, "a text is missing on trend");
 
     // One parcel, opened by its button and closed by the key that dialogs have.
     browser.run("location.hash = '#parcels'").await;
@@ -79,6 +89,18 @@ async fn the_page_shows_pictures_and_parcels_in_both_languages_and_its_console_i
     let table = browser.run(table).await;
     let lines: Vec<&str> = table.as_str().expect("text").lines().collect();
     assert!(lines[0].starts_with("n,utc,seq,length_mm,") && lines.len() > 2, "{lines:?}");
+
+    // Everything for somebody elsewhere.
+    browser.run("location.hash = '#events'").await;
+    let bundle = "document.querySelector('a[download=\"beltgauge-bundle.tar.gz\"]')";
+    browser.wait("the link", &format!("return {bundle} !== null")).await;
+    let begins = format!(
+        "return fetch({bundle}.href).then((answer) => answer.arrayBuffer())
+            .then((file) => new DataView(file).getUint16(0))"
+    );
+    assert_eq!(browser.run(&begins).await, 0x1f8b, "it is gzip");
+    browser.run("location.hash = '#parcels'").await;
+    browser.wait("the link", "return document.querySelector('a[download]') !== null").await;
 
     // Older ones come from the archive.
     browser.run("[...document.querySelectorAll('main button')].at(-1).click()").await;
@@ -118,6 +140,76 @@ async fn the_page_shows_pictures_and_parcels_in_both_languages_and_its_console_i
     let console = browser.console().await;
     assert!(console.is_empty(), "{console:#?}");
     browser.end().await;
+}
+
+/// What axe finds on the page as it is: rules and the elements that break them.
+const BROKEN_RULES: &str = "return axe.run(document, { resultTypes: ['violations'] }).then((found) =>
+    found.violations.map((rule) => `${rule.id}: ${rule.nodes.map((node) => node.html).join(' ')}`))";
+
+#[tokio::test(flavor = "multi_thread")]
+async fn every_page_keeps_the_rules_of_accessibility_and_is_reached_by_keyboard() {
+    let demo = Demo::start("web-axe", 600, false);
+    let browser = Browser::start([1400, 1100]).await;
+    browser.client.goto(&format!("http://{}/", demo.page)).await.expect("it opens");
+    browser.run(&axe()).await;
+    let parcels = "return document.querySelectorAll('td button.link').length > 1";
+    browser.wait("parcels", parcels).await;
+    for theme in ["light", "dark"] {
+        browser.run("document.getElementById('theme').click()").await;
+        let shown = format!("return document.documentElement.dataset.theme === '{theme}'");
+        browser.wait(theme, &shown).await;
+        for name in ["overview", "parcels", "trend", "plc", "events"] {
+            browser.run(&format!("location.hash = '#{name}'")).await;
+            browser.wait(name, "return document.querySelector('canvas, tbody tr') !== null").await;
+            assert_eq!(browser.run(BROKEN_RULES).await, json!([]), "{name}, {theme}");
+        }
+        browser.run("location.hash = '#parcels'").await;
+        browser.wait("parcels", parcels).await;
+        browser.run("document.querySelector('td button.link').click()").await;
+        browser.wait("its page", "return document.getElementById('dialog').open").await;
+        assert_eq!(browser.run(BROKEN_RULES).await, json!([]), "a parcel, {theme}");
+    }
+    let escape = "\u{e00c}";
+    browser.client.active_element().await.expect("one").send_keys(escape).await.expect("typed");
+    for name in ["overview", "trend", "plc", "events"] {
+        browser.run(&format!("location.hash = '#{name}'")).await;
+        browser.wait(name, "return document.querySelector('canvas, tbody tr') !== null").await;
+        assert_eq!(beyond_the_keyboard(&browser).await, json!([]), "{name}");
+    }
+    // Either would find something.
+    browser.run("document.querySelector('nav a').tabIndex = -1; delete document.querySelector('nav a').dataset.reached").await;
+    assert_ne!(beyond_the_keyboard(&browser).await, json!([]));
+    browser.run("location.hash = '#parcels'").await;
+    browser.wait("parcels", parcels).await;
+    browser.run("document.querySelector('td button.link').click()").await;
+    browser.wait("its page", "return document.getElementById('dialog').open").await;
+    browser.run("document.querySelector('#dialog img').removeAttribute('alt')").await;
+    assert_ne!(browser.run(BROKEN_RULES).await, json!([]));
+    browser.end().await;
+}
+
+/// What can be clicked and is not reached by the Tab key, which goes around the page.
+async fn beyond_the_keyboard(browser: &Browser) -> Value {
+    let tab = "\u{e004}";
+    // Rows of parcels are drawn anew while it goes around: they are left out.
+    for _ in 0..40 {
+        browser.client.active_element().await.expect("one").send_keys(tab).await.expect("typed");
+        browser.run("document.activeElement.dataset.reached = 'yes'").await;
+    }
+    let left = "return [...document.querySelectorAll('a, button:not(td button), select')].filter(
+        (one) => one.checkVisibility() && !one.dataset.reached).map((one) => one.outerHTML)";
+    browser.run(left).await
+}
+
+/// Deque's axe, out of the Python package that `.ci/run` installs.
+fn axe() -> String {
+    let libraries =
+        std::fs::read_dir(hil::project().join("target/hil-venv/lib")).expect("installed");
+    let scripts = libraries.map(|python| {
+        let package = python.expect("readable").path().join("site-packages/axe_playwright_python");
+        std::fs::read_to_string(package.join("axe.min.js"))
+    });
+    scripts.into_iter().find_map(Result::ok).expect("`.ci/run` installs axe-playwright-python")
 }
 
 /// Every text that the machine tells begins with markup: names of cameras, sticks and interfaces, paths,

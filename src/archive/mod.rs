@@ -18,7 +18,7 @@ mod segment;
 mod writer;
 
 pub use follow::Follower;
-pub use reader::{Reader, Stored, Verdict};
+pub use reader::{Page, Reader, Stored, Verdict};
 pub use writer::{Archive, Condition};
 
 /// What an entry is of.

@@ -14,6 +14,23 @@ pub struct Stored {
     pub entry: Entry,
 }
 
+impl Stored {
+    /// As a line of JSON, without the picture.
+    pub fn json(&self) -> String {
+        let (number, kind, what) = (self.number, self.entry.kind.name(), &self.entry.text);
+        format!("{{\"entry\":{number},\"kind\":\"{kind}\",\"what\":{what}}}")
+    }
+}
+
+/// A part of the archive.
+#[derive(Clone, Debug, Default, PartialEq, Eq)]
+pub struct Page {
+    /// Entries, newest first, without their pictures.
+    pub entries: Vec<Stored>,
+    /// Where entries are missing because they cannot be read: a segment, and what is wrong with it.
+    pub unread: Vec<String>,
+}
+
 /// What [`Reader::verify`] found.
 #[derive(Clone, Debug, Default, PartialEq, Eq)]
 pub struct Verdict {
@@ -31,6 +48,58 @@ pub struct Verdict {
     pub torn_bytes: u64,
     /// Where the chain is broken: something was changed, taken out, or damaged.
     pub broken: Vec<String>,
+}
+
+impl Page {
+    fn unread(&mut self, segment: &Path, why: &str) {
+        let name = segment.file_name().unwrap_or_default().to_string_lossy();
+        self.unread.push(format!("{name}: {why}"));
+    }
+
+    /// Add the last entries of a segment, until there are `limit`.
+    fn add_last_of(&mut self, path: &Path, before: u64, limit: usize) -> std::io::Result<()> {
+        let length = std::fs::metadata(path)?.len();
+        let Some(mut segment) = Segment::open(path)? else {
+            // One that is shorter was begun when the power went.
+            if length > HEAD_BYTES as u64 {
+                self.unread(path, "its head is damaged");
+            }
+            return Ok(());
+        };
+        let (mut heads, mut next) = (Vec::<(EntryHead, u64)>::new(), segment.head.first);
+        let why = loop {
+            match segment.pass(length) {
+                Ok(Some((head, _))) if head.number >= before => break None,
+                Ok(Some((head, at))) => {
+                    next = head.number + 1;
+                    heads.push((head, at));
+                }
+                Ok(None) => match segment.ending(next, length) {
+                    Ok(Ending::Damaged) => break Some("damaged".to_owned()),
+                    Ok(Ending::Whole | Ending::Torn) => break None,
+                    Err(e) => break Some(format!("cannot be read: {e}")),
+                },
+                Err(e) => break Some(format!("cannot be read: {e}")),
+            }
+        };
+        if let Some(why) = why {
+            self.unread(path, &format!("{why} where entry {next} should be"));
+        }
+        let room = limit - self.entries.len();
+        for (head, at) in heads.into_iter().rev().take(room) {
+            let number = head.number;
+            // Its sum is not asked for: that takes the ones before.
+            match segment.seek(at).and_then(|()| segment.next(&Sum::default())) {
+                Ok(Some((_, mut entry, _))) => {
+                    entry.picture = Vec::new();
+                    self.entries.push(Stored { number, entry });
+                }
+                Ok(None) => {}
+                Err(e) => self.unread(path, &format!("entry {number} cannot be read: {e}")),
+            }
+        }
+        Ok(())
+    }
 }
 
 /// An archive to read.
@@ -59,51 +128,32 @@ impl Reader {
         segment::list(&self.folder).map_err(|e| self.failed(&e))
     }
 
-    /// At most `limit` entries before number `before` (none: from the newest on), newest first, without
-    /// their pictures. A page takes as long as one segment, however large the archive is.
-    pub fn before(&self, before: Option<u64>, limit: usize) -> Result<Vec<Stored>> {
+    /// At most `limit` entries before number `before` (none: from the newest on). It takes as long as one
+    /// segment, however large the archive is.
+    ///
+    /// # Errors
+    /// When nothing can be read and the disk says why. Otherwise what cannot be read hides nothing else.
+    pub fn before(&self, before: Option<u64>, limit: usize) -> Result<Page> {
         let before = before.unwrap_or(u64::MAX);
-        let (mut found, mut failed) = (Vec::new(), None);
+        let (mut page, mut failed) = (Page::default(), None);
         for (first, path) in self.segments()?.into_iter().rev() {
-            if first >= before || found.len() == limit {
+            if first >= before || page.entries.len() == limit {
                 continue;
             }
-            // The writer may have taken it away; what cannot be read hides nothing else: `verify` tells.
-            if let Err(e) = Self::last_of(&path, before, limit - found.len(), &mut found) {
-                failed = Some(e).filter(|e| e.kind() != std::io::ErrorKind::NotFound);
+            match page.add_last_of(&path, before, limit) {
+                // The writer may have taken it away.
+                Err(e) if e.kind() == std::io::ErrorKind::NotFound => {}
+                Err(e) => {
+                    page.unread(&path, &format!("cannot be read: {e}"));
+                    failed = Some(e);
+                }
+                Ok(()) => {}
             }
         }
         match failed {
-            Some(e) if found.is_empty() => Err(self.failed(&e)),
-            _ => Ok(found),
+            Some(e) if page.entries.is_empty() => Err(self.failed(&e)),
+            _ => Ok(page),
         }
-    }
-
-    fn last_of(
-        path: &Path,
-        before: u64,
-        limit: usize,
-        found: &mut Vec<Stored>,
-    ) -> std::io::Result<()> {
-        let Some(mut segment) = Segment::open(path)? else { return Ok(()) };
-        let length = std::fs::metadata(path)?.len();
-        let mut heads: Vec<(EntryHead, u64)> = Vec::new();
-        // Up to what cannot be read.
-        while let Ok(Some((head, at))) = segment.pass(length) {
-            if head.number >= before {
-                break;
-            }
-            heads.push((head, at));
-        }
-        for (head, at) in heads.into_iter().rev().take(limit) {
-            segment.seek(at)?;
-            // Its sum is not asked for: that takes the ones before.
-            if let Some((_, mut entry, _)) = segment.next(&Sum::default())? {
-                entry.picture = Vec::new();
-                found.push(Stored { number: head.number, entry });
-            }
-        }
-        Ok(())
     }
 
     /// One entry with its picture.

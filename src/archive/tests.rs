@@ -64,7 +64,8 @@ fn what_was_written_is_read_again_newest_first_and_the_chain_holds() {
     assert!(verdict.broken.is_empty() && verdict.torn_bytes == 0, "{:?}", verdict.broken);
     let numbers = |before, limit| {
         let found = reader.before(before, limit).expect("readable");
-        found.iter().map(|stored| stored.number).collect::<Vec<_>>()
+        assert!(found.unread.is_empty(), "{found:?}");
+        found.entries.iter().map(|stored| stored.number).collect::<Vec<_>>()
     };
     assert_eq!(numbers(None, 3), [120, 119, 118]);
     assert_eq!(numbers(Some(85), 100), (1..85).rev().collect::<Vec<_>>(), "over segments");
@@ -320,9 +321,13 @@ fn damage_in_the_newest_segment_is_no_power_cut_and_no_number_is_given_again() {
         let (verdict, last) = verified(&folder);
         assert!(!verdict.broken.is_empty(), "byte {at}: it is still told");
         assert!(last > 6, "byte {at}: number {last} may be another entry's");
-        let newest = Reader::open(&folder).expect("there").before(None, 2).expect("readable");
+        let reader = Reader::open(&folder).expect("there");
+        let newest = reader.before(None, 2).expect("readable").entries;
         assert_eq!(newest[0].entry.text, entry(6, 40).text);
         assert!(newest[1].entry.text.contains("\"damaged\":\"0000"), "{newest:?}");
+        let all = reader.before(None, 99).expect("readable");
+        let [unread] = &all.unread[..] else { panic!("byte {at}: {all:?}") };
+        assert!(unread.starts_with(&name.unwrap_or_default()), "byte {at}: {unread}");
     }
 }
 
@@ -363,7 +368,9 @@ fn what_cannot_be_read_is_passed_over_and_told() {
     assert!(verdict.entries == 5 && last > 5 && !verdict.broken.is_empty(), "{verdict:?}");
     let found =
         Reader::open(&folder).expect("there").before(None, 9).expect("the rest is readable");
-    assert_eq!(found.len(), 5);
+    assert_eq!(found.entries.len(), 5);
+    let [unread] = &found.unread[..] else { panic!("{:?}", found.unread) };
+    assert!(unread.starts_with("00000000000000000004.bga: cannot be read: "), "{unread}");
 }
 
 /// Numbers of what follows, read so many at a time.

@@ -8,7 +8,7 @@ use serde::{Deserialize, Serialize};
 use std::path::Path;
 
 /// The file as written. Unknown keys are allowed: calibration reports add to it.
-#[derive(Clone, Debug, Deserialize)]
+#[derive(Clone, Debug, Deserialize, Serialize)]
 pub struct CameraFile {
     image_size_px: [usize; 2],
     lens: LensTable,
@@ -150,6 +150,18 @@ impl LensSigmaTable {
         let [fx_px, fy_px, cx_px, cy_px, ..] = sigma;
         let distortion = sigma[4..4 + model.distortion_count()].to_vec();
         Self { fx_px, fy_px, cx_px, cy_px, distortion }
+    }
+}
+
+impl From<&Camera> for CameraFile {
+    /// The camera alone: what the calibration knew beside it is not in it.
+    fn from(camera: &Camera) -> Self {
+        Self {
+            image_size_px: camera.image_size_px,
+            lens: (&camera.lens).into(),
+            lens_sigma: None,
+            pose: Some(camera.into()),
+        }
     }
 }
 

@@ -57,10 +57,10 @@ impl Site {
     /// Files that the configuration names are beside it.
     pub fn beside(&mut self, path: &Path) {
         let folder = path.parent().unwrap_or(Path::new("."));
-        let Config { plc, archive, fleet, .. } = &mut self.config;
+        let Config { camera, plc, archive, fleet, .. } = &mut self.config;
         let named =
             [&mut plc.state_file, &mut archive.folder, &mut fleet.login_file, &mut fleet.ca_file];
-        for file in named.into_iter().flatten() {
+        for file in named.into_iter().flatten().chain([&mut camera.calibration]) {
             *file = folder.join(&*file);
         }
     }

@@ -19,10 +19,11 @@ pub struct Export<'a> {
     pub pictures: Option<&'a Path>,
 }
 
-/// The last entries, newest first.
+/// The last entries, newest first, and what of them cannot be read.
 pub fn list(folder: &Path, last: usize) -> Result<String> {
     let mut text = String::new();
-    for stored in Reader::open(folder)?.before(None, last)? {
+    let page = Reader::open(folder)?.before(None, last)?;
+    for stored in page.entries {
         // Writing to a string does not fail.
         let _ = writeln!(
             text,
@@ -31,6 +32,9 @@ pub fn list(folder: &Path, last: usize) -> Result<String> {
             columns::utc(stored.entry.utc_ms),
             line(&stored)
         );
+    }
+    for unread in page.unread {
+        let _ = writeln!(text, "warning: {unread}");
     }
     Ok(text)
 }
@@ -95,9 +99,7 @@ pub fn export(folder: &Path, to: Export<'_>) -> Result<String> {
             csv.write(&columns::line(stored.number, stored.entry.utc_ms, &record))?;
         }
         if let Some(jsonl) = &mut jsonl {
-            let (number, kind) = (stored.number, stored.entry.kind.name());
-            let what = &stored.entry.text;
-            jsonl.write(&format!("{{\"entry\":{number},\"kind\":\"{kind}\",\"what\":{what}}}"))?;
+            jsonl.write(&stored.json())?;
         }
         if let Some(folder) = to.pictures.filter(|_| !stored.entry.picture.is_empty()) {
             let path = folder.join(format!("{:08}.jpg", stored.number));

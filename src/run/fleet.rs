@@ -42,7 +42,7 @@ pub fn entry_time(folder: &Path, number: u64) -> std::result::Result<(Option<u64
     let look = || -> Result<_> {
         let reader = Reader::open(folder)?;
         let time = reader.entry(number)?.map(|stored| stored.entry.utc_ms);
-        Ok((time, reader.before(None, 1)?.first().map_or(0, |stored| stored.number)))
+        Ok((time, reader.before(None, 1)?.entries.first().map_or(0, |stored| stored.number)))
     };
     look().map_err(|e| e.to_string())
 }

@@ -2,11 +2,13 @@
 
 use super::assets::ASSETS;
 use super::board::{Board, PARCELS_MAX, View};
+use super::bundle::{self, Packing};
 use super::guard::{self, Hosts};
 use super::metrics;
-use super::model::{Archived, Event, Machine, Parcel};
+use super::model::{Archived, BundleFile, Event, Machine, Parcel, Point};
 use crate::config::Web as Settings;
 use crate::event::csv;
+use axum::body::Body;
 use axum::extract::{Path, RawQuery, Request, State};
 use axum::http::{Method, StatusCode, header};
 use axum::middleware::{self, Next};
@@ -14,6 +16,7 @@ use axum::response::{IntoResponse, Response};
 use axum::routing::get;
 use axum::{Json, Router};
 use serde::Serialize;
+use std::borrow::Borrow;
 use std::sync::Arc;
 use std::time::Duration;
 use tokio::sync::Semaphore;
@@ -22,6 +25,10 @@ use tokio::sync::Semaphore;
 const PICTURE_PATIENCE: Duration = Duration::from_secs(1);
 /// Entries of the archive in one answer.
 const ARCHIVED_MAX: usize = 100;
+/// Pieces of the trend in one answer; a page asks until there are no more.
+const POINTS_MAX: usize = 500;
+/// Support bundles that are made at once: each holds a file and the packer's tables, about 2 MB.
+const BUNDLES_MAX: usize = 4;
 /// A number in a query has no more digits.
 const DIGITS_MAX: usize = 20;
 
@@ -37,6 +44,7 @@ struct Sources {
     board: Arc<Board>,
     machine: Arc<dyn Machine>,
     questions: Arc<Semaphore>,
+    bundles: Arc<Semaphore>,
 }
 
 /// All that is served; so many questions at most may wait for the disk as there are visitors.
@@ -44,6 +52,7 @@ pub(super) fn router(board: Arc<Board>, machine: Arc<dyn Machine>, settings: &Se
     let hosts = Hosts::new(settings);
     // A visitor asks one question at a time.
     let questions = Arc::new(Semaphore::new(settings.connections_max));
+    let bundles = Arc::new(Semaphore::new(BUNDLES_MAX));
     let patience = patience(settings);
     let mut router = Router::new();
     for (path, kind, bytes) in ASSETS {
@@ -57,13 +66,15 @@ pub(super) fn router(board: Arc<Board>, machine: Arc<dyn Machine>, settings: &Se
         .route("/api/parcels.csv", get(parcels_csv))
         .route("/api/parcels/{n}/picture", get(parcel_picture))
         .route("/api/events", get(events))
+        .route("/api/trend", get(trend))
         .route("/api/live/{view}", get(live))
         .route("/api/archive", get(archive))
         .route("/api/archive/{entry}/picture", get(archive_picture))
+        .route("/api/bundle.tar.gz", get(bundle))
         .route("/metrics", get(metrics))
         .fallback(|| async { refusal(StatusCode::NOT_FOUND, "there is no such page") })
         .layer(middleware::from_fn_with_state(hosts, admit))
-        .with_state(Sources { patience, board, machine, questions })
+        .with_state(Sources { patience, board, machine, questions, bundles })
 }
 
 /// For visitors whom `web.allow` does not name: nothing but why.
@@ -141,12 +152,12 @@ struct Listed<'a, T> {
 
 fn listed<T: Serialize>(
     board: &Board,
-    items: &[Arc<T>],
+    items: &[impl Borrow<T>],
     since: u64,
     n: impl Fn(&T) -> u64,
 ) -> Response {
-    let next = items.last().map_or(since, |item| n(item));
-    let items = items.iter().map(|item| &**item).collect();
+    let next = items.last().map_or(since, |item| n(item.borrow()));
+    let items = items.iter().map(Borrow::borrow).collect();
     Json(Listed { run: board.started_ms(), items, next }).into_response()
 }
 
@@ -162,6 +173,14 @@ async fn parcels(
 
 /// The last parcels, for a spreadsheet.
 async fn parcels_csv(State(from): State<Sources>) -> Response {
+    let headers = [
+        (header::CONTENT_TYPE, "text/csv; charset=utf-8"),
+        (header::CONTENT_DISPOSITION, "attachment; filename=\"parcels.csv\""),
+    ];
+    (headers, parcel_table(&from)).into_response()
+}
+
+fn parcel_table(from: &Sources) -> String {
     let state = from.machine.state();
     let mut text = csv::header("n");
     for parcel in from.board.parcels_since(0, PARCELS_MAX) {
@@ -174,11 +193,34 @@ async fn parcels_csv(State(from): State<Sources>) -> Response {
         text.push_str(&csv::line(parcel.n, parcel.utc_ms, &record));
     }
     text.push('\n');
+    text
+}
+
+/// Everything that a person elsewhere needs to see what is wrong.
+async fn bundle(State(from): State<Sources>) -> Result<Response, Response> {
+    let busy = |_| refusal(StatusCode::SERVICE_UNAVAILABLE, "others are taking it: ask again");
+    let place = Arc::clone(&from.bundles).try_acquire_owned().map_err(busy)?;
+    let files = own_files(&from).into_iter().chain(from.machine.bundle());
+    let packing = Packing::new(Box::new(files), from.machine.state().utc_ms);
     let headers = [
-        (header::CONTENT_TYPE, "text/csv; charset=utf-8"),
-        (header::CONTENT_DISPOSITION, "attachment; filename=\"parcels.csv\""),
+        (header::CONTENT_TYPE, "application/gzip"),
+        (header::CONTENT_DISPOSITION, "attachment; filename=\"beltgauge-bundle.tar.gz\""),
     ];
-    (headers, text).into_response()
+    Ok((headers, Body::from_stream(bundle::stream(packing, place))).into_response())
+}
+
+/// What the page shows, as files of the bundle.
+fn own_files(from: &Sources) -> [BundleFile; 4] {
+    let json = |what: serde_json::Result<Vec<u8>>| what.map_err(|e| e.to_string());
+    let events = from.board.events_since(0);
+    let events: Vec<&Event> = events.iter().map(|event| &**event).collect();
+    [
+        ("state.json", json(serde_json::to_vec_pretty(&from.machine.state()))),
+        ("plc.json", json(serde_json::to_vec_pretty(&from.machine.plc()))),
+        ("events.json", json(serde_json::to_vec_pretty(&events))),
+        ("parcels.csv", Ok(parcel_table(from).into_bytes())),
+    ]
+    .map(|(name, bytes)| BundleFile { name: name.to_owned(), bytes })
 }
 
 async fn events(
@@ -188,6 +230,15 @@ async fn events(
     let since = number(query.as_deref(), "since")?.unwrap_or(0);
     let items = from.board.events_since(since);
     Ok(listed(&from.board, &items, since, |event: &Event| event.n))
+}
+
+async fn trend(
+    State(from): State<Sources>,
+    RawQuery(query): RawQuery,
+) -> Result<Response, Response> {
+    let since = number(query.as_deref(), "since")?.unwrap_or(0);
+    let points = from.board.points_since(since, POINTS_MAX);
+    Ok(listed(&from.board, &points, since, |point: &Point| point.n))
 }
 
 async fn parcel_picture(State(from): State<Sources>, Path(n): Path<String>) -> Response {

@@ -4,6 +4,7 @@
 const HTML: &str = "text/html; charset=utf-8";
 const CSS: &str = "text/css; charset=utf-8";
 const SCRIPT: &str = "text/javascript; charset=utf-8";
+const TEXT: &str = "text/plain; charset=utf-8";
 const JSON: &str = "application/json";
 const SVG: &str = "image/svg+xml";
 
@@ -19,6 +20,11 @@ pub(super) const ASSETS: &[(&str, &str, &[u8])] = &[
     ("/parcels.js", SCRIPT, include_bytes!("page/parcels.js")),
     ("/plc.js", SCRIPT, include_bytes!("page/plc.js")),
     ("/events.js", SCRIPT, include_bytes!("page/events.js")),
+    ("/trend.js", SCRIPT, include_bytes!("page/trend.js")),
+    // As it is published: https://github.com/leeoniya/uPlot, version 1.6.32.
+    ("/uplot.js", SCRIPT, include_bytes!("page/uplot/uPlot.iife.min.js")),
+    ("/uplot.css", CSS, include_bytes!("page/uplot/uPlot.min.css")),
+    ("/uplot.txt", TEXT, include_bytes!("page/uplot/LICENSE")),
     ("/en.json", JSON, include_bytes!("page/en.json")),
     ("/de.json", JSON, include_bytes!("page/de.json")),
 ];

@@ -1,6 +1,6 @@
-//! What was put up to be looked at: the newest live pictures, the last parcels and events.
+//! What was put up to be looked at: the newest live pictures, the last parcels and events, the trend.
 
-use super::model::{Event, Parcel};
+use super::model::{Event, Parcel, Point};
 use std::collections::VecDeque;
 use std::sync::atomic::{AtomicU64, AtomicUsize, Ordering};
 use std::sync::{Arc, Mutex, MutexGuard, OnceLock, PoisonError};
@@ -12,6 +12,8 @@ use tokio::sync::watch;
 pub const PARCELS_MAX: usize = 200;
 /// The same of events.
 pub const EVENTS_MAX: usize = 300;
+/// The same of the trend: eight hours, a shift, in pieces of ten seconds.
+pub const POINTS_MAX: usize = 2880;
 /// A live picture that is older shows something else by now.
 const FRESH: Duration = Duration::from_millis(300);
 
@@ -42,6 +44,7 @@ pub struct Board {
     started_ms: u64,
     parcels: Mutex<VecDeque<(Arc<Parcel>, axum::body::Bytes)>>,
     events: Mutex<VecDeque<Arc<Event>>>,
+    points: Mutex<VecDeque<Point>>,
     parcels_told: AtomicU64,
     events_told: AtomicU64,
     live: [Live; 2],
@@ -63,6 +66,7 @@ impl Board {
             started_ms,
             parcels: Mutex::default(),
             events: Mutex::default(),
+            points: Mutex::new(VecDeque::with_capacity(POINTS_MAX)),
             parcels_told: AtomicU64::new(0),
             events_told: AtomicU64::new(0),
             live: [watch::Sender::new(None), watch::Sender::new(None)],
@@ -96,6 +100,20 @@ impl Board {
         let event = Arc::new(event);
         put(&mut lock(&self.events), EVENTS_MAX, Arc::clone(&event));
         event
+    }
+
+    /// Put up a piece of the trend; it gets its number.
+    pub fn point(&self, mut point: Point) {
+        let mut points = lock(&self.points);
+        point.n = points.back().map_or(0, |last| last.n) + 1;
+        put(&mut points, POINTS_MAX, point);
+    }
+
+    /// Pieces of the trend after number `n`, oldest first, at most so many of the oldest.
+    pub fn points_since(&self, n: u64, limit: usize) -> Vec<Point> {
+        let points = lock(&self.points);
+        let seen = points.partition_point(|point| point.n <= n);
+        points.range(seen..).take(limit).copied().collect()
     }
 
     /// Parcels after number `n`, oldest first, at most so many of the newest.
@@ -204,6 +222,16 @@ mod tests {
         assert_eq!((last.len(), last[0].n, last[EVENTS_MAX - 1].n), (EVENTS_MAX, 701, 1000));
         assert_eq!(board.events_since(998).len(), 2);
         assert!(board.events_since(5000).is_empty());
+        for _ in 0..POINTS_MAX + 70 {
+            board.point(Point::default());
+        }
+        let numbers = |since, limit| {
+            let points = board.points_since(since, limit);
+            (points.len(), points.first().map(|point| point.n), points.last().map(|point| point.n))
+        };
+        assert_eq!(numbers(0, 9), (9, Some(71), Some(79)), "the oldest are gone");
+        assert_eq!(numbers(2948, 9), (2, Some(2949), Some(2950)));
+        assert_eq!(numbers(2950, 9), (0, None, None));
     }
 
     #[test]

@@ -20,6 +20,21 @@ pub trait Machine: Send + Sync + 'static {
     fn archived(&self, before: Option<u64>, limit: usize) -> Result<Archived, String>;
     /// The picture of an entry of the archive. May wait for the disk.
     fn archived_picture(&self, entry: u64) -> Option<Vec<u8>>;
+    /// What it adds to the support bundle: each file is made when it is asked for, and may wait for the
+    /// disk.
+    fn bundle(&self) -> BundleFiles;
+}
+
+/// Files of the support bundle, one after the other.
+pub type BundleFiles = Box<dyn Iterator<Item = BundleFile> + Send>;
+
+/// A file of the support bundle.
+#[derive(Clone, Debug)]
+pub struct BundleFile {
+    /// Its path in the bundle.
+    pub name: String,
+    /// What is in it, or why it is left out.
+    pub bytes: Result<Vec<u8>, String>,
 }
 
 /// The machine's state.
@@ -214,6 +229,31 @@ pub struct Event {
     pub detail: String,
 }
 
+/// A piece of the trend: what happened meanwhile.
+#[derive(Clone, Copy, Debug, Default, Serialize)]
+pub struct Point {
+    /// Its number, from 1 at start.
+    pub n: u64,
+    /// When it ended, ms since 1970.
+    pub utc_ms: u64,
+    /// How long it is.
+    pub span_s: f32,
+    /// Parcels told.
+    pub parcels: u32,
+    /// Of these, parcels whose dimensions must not be used, measured or not.
+    pub refused: u32,
+    /// Of these, parcels that could not be measured.
+    pub unmeasured: u32,
+    /// Means of the standard deviations of length, width and height of those that were measured.
+    pub sigma_mm: Option<[f32; 3]>,
+    /// The belt's speed at its end; `None`: not measured.
+    pub belt_speed_mm_per_s: Option<f32>,
+    /// Standard deviation of the picture's blur at its end; `None`: not known.
+    pub blur_px: Option<f32>,
+    /// Frames that came too late, torn or not at all.
+    pub frames_missing: u32,
+}
+
 /// Entries of the archive.
 #[derive(Clone, Debug, Default, Serialize)]
 pub struct Archived {
@@ -221,6 +261,8 @@ pub struct Archived {
     pub entries: Vec<serde_json::Value>,
     /// Ask for what is before this one; none: there is no more.
     pub before: Option<u64>,
+    /// Where entries are missing among these because they cannot be read.
+    pub unread: Vec<String>,
 }
 
 /// The PLC's side.

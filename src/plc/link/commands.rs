@@ -120,14 +120,22 @@ impl Link {
             if self.decided.is_empty() {
                 self.status.outcome = outcome;
             }
+            if !is_repetition {
+                self.refuse(Commanded { sender, ticket, command, argument, outcome });
+            }
             let noted = self.decided.back().map_or(0, |decided| decided.noted);
             return Answer { noted, ticket, outcome };
         }
         if self.decided.is_full() {
             // The disk hangs. `ticket_done` stays what it was, and nothing is noted: the same ticket may
             // come again.
-            return Answer { noted: 0, ticket, outcome: Outcome::Busy as u16 };
+            let outcome = Outcome::Busy as u16;
+            if ticket != 0 {
+                self.refuse(Commanded { sender, ticket, command, argument, outcome });
+            }
+            return Answer { noted: 0, ticket, outcome };
         }
+        self.refused = None;
         let (outcome, request) =
             if ticket == 0 { (Outcome::None, None) } else { self.decide(command, argument) };
         if ticket != 0 {
@@ -145,6 +153,17 @@ impl Link {
         self.journal.save();
         self.publish_kept();
         Answer { noted, ticket, outcome: outcome as u16 }
+    }
+
+    /// A command is refused before it is decided on: those who watch are told once, however often it is
+    /// written.
+    fn refuse(&mut self, given: Commanded) {
+        if self.refused != Some(given) {
+            let Commanded { sender, ticket, command, argument, outcome } = given;
+            tracing::warn!(%sender, ticket, command, argument, outcome, "command refused");
+            self.refused = Some(given);
+            self.tell(given);
+        }
     }
 
     /// What becomes of a command. What it changes for good is noted together with its ticket.

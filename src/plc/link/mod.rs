@@ -64,6 +64,8 @@ pub struct Link {
     commanded: Deque<Commanded, COMMANDED_MAX>,
     /// Commands that found `commanded` full.
     commands_untold: u64,
+    /// The last one that was refused before it was decided on: a PLC may write it again and again.
+    refused: Option<Commanded>,
     /// Parcels that found `waiting` full.
     unpublished: u64,
     counts: Deque<(u32, Instant), COUNTS_MAX>,
@@ -148,6 +150,7 @@ impl Link {
             written: None,
             commanded: Deque::new(),
             commands_untold: 0,
+            refused: None,
             unpublished: 0,
             counts: Deque::new(),
             requests: Deque::new(),
@@ -360,9 +363,13 @@ impl Link {
         }
         (self.status.ticket, self.status.outcome) = (decided.ticket, decided.outcome as u16);
         if let Some(given) = decided.given {
-            self.commands_untold += u64::from(self.commanded.push_back(given).is_err());
+            self.tell(given);
         }
         self.show_settings();
+    }
+
+    fn tell(&mut self, given: Commanded) {
+        self.commands_untold += u64::from(self.commanded.push_back(given).is_err());
     }
 
     /// What commands have set.

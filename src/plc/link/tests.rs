@@ -389,9 +389,23 @@ fn a_sender_that_finds_the_disk_hanging_is_told_so_of_its_own_ticket() {
             given: None,
         });
     }
-    let answer = link.command(77, 3, 0, SENDER);
-    assert_eq!((answer.ticket, answer.outcome), (77, Outcome::Busy as u16));
+    // A PLC writes it again and again; those who watch are told once.
+    for _ in 0..100 {
+        let answer = link.command(77, 3, 0, SENDER);
+        assert_eq!((answer.ticket, answer.outcome), (77, Outcome::Busy as u16));
+        link.command(0, 0, 0, SENDER);
+    }
+    let told = |link: &mut Link| -> Vec<_> {
+        std::iter::from_fn(|| link.next_commanded()).map(|c| (c.ticket, c.outcome)).collect()
+    };
+    assert_eq!(told(&mut link), [(77, Outcome::Busy as u16)]);
     // Nothing was noted of it: the same ticket may come again.
     link.publish_kept();
     assert_eq!(link.command(77, 3, 0, SENDER).outcome, Outcome::Done as u16);
+    link.publish_kept();
+    // The ticket was used for another command by then.
+    link.command(77, 4, 0, SENDER);
+    link.command(77, 4, 0, SENDER);
+    let outcomes = [Outcome::Done, Outcome::TicketUsed].map(|outcome| (77, outcome as u16));
+    assert_eq!(told(&mut link), outcomes);
 }

@@ -14,7 +14,7 @@ mod capture;
 mod plc;
 mod vision;
 
-use super::desk::{self, Desk, Insight, Rings};
+use super::desk::{self, Desk, Insight, Papers, Rings};
 use super::fleet::{self as fleet_side, Lane};
 use super::memory::Carved;
 use super::realtime;
@@ -220,7 +220,8 @@ impl Appliance {
         let config = self.site.config.clone();
         let (listener, journal, mut watchdog) = (self.listener, self.journal, self.watchdog);
         let clients = ClientList::new(config.modbus.connections_max);
-        let insight = Arc::new(Insight::new(config.clone(), feed.size_px(), clients.room()));
+        let (papers, room) = (Papers::of(&self.site)?, clients.room());
+        let insight = Arc::new(Insight::new(config.clone(), papers, feed.size_px(), room));
         let (page, board) = (self.page, desk::board());
         let encoder = encoder(&config);
         let Carved { buffers, pipeline, shots } = super::memory::carve(self.site)?;

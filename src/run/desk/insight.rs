@@ -1,7 +1,8 @@
 //! What the page asks of the machine, from what its threads have told last.
 
+use super::bundle::{self, Papers};
 use super::lamps::lamps;
-use crate::archive::{Condition, Reader, Stored};
+use crate::archive::{Condition, Page, Reader, Stored};
 use crate::config::{Config, WordOrder};
 use crate::plc::clients::{Client, ClientList};
 use crate::plc::command::Sender;
@@ -36,6 +37,7 @@ pub struct PlcSide {
 /// What is known, for whoever asks.
 pub struct Insight {
     config: Config,
+    papers: Papers,
     image_size_px: [usize; 2],
     started: Instant,
     plc: Mutex<PlcSide>,
@@ -70,10 +72,16 @@ pub fn utc_ms() -> u64 {
 
 impl Insight {
     /// Nothing is known yet.
-    pub fn new(config: Config, image_size_px: [usize; 2], clients_max: usize) -> Self {
+    pub fn new(
+        config: Config,
+        papers: Papers,
+        image_size_px: [usize; 2],
+        clients_max: usize,
+    ) -> Self {
         let status = Status::default();
         Self {
             config,
+            papers,
             image_size_px,
             started: Instant::now(),
             plc: Mutex::new(PlcSide {
@@ -235,8 +243,8 @@ impl web::Machine for Insight {
 
     fn archived(&self, before: Option<u64>, limit: usize) -> Result<web::Archived, String> {
         let reader = Reader::open(self.archive_folder()?).map_err(|e| e.to_string())?;
-        let stored = reader.before(before, limit).map_err(|e| e.to_string())?;
-        let last = stored.last().map(|stored| stored.number);
+        let Page { entries, unread } = reader.before(before, limit).map_err(|e| e.to_string())?;
+        let last = entries.last().map(|stored| stored.number);
         let entry = |stored: Stored| {
             let what: serde_json::Value =
                 serde_json::from_str(&stored.entry.text).unwrap_or_default();
@@ -248,8 +256,9 @@ impl web::Machine for Insight {
             })
         };
         Ok(web::Archived {
-            before: last.filter(|_| stored.len() == limit),
-            entries: stored.into_iter().map(entry).collect(),
+            before: last.filter(|_| entries.len() == limit),
+            entries: entries.into_iter().map(entry).collect(),
+            unread,
         })
     }
 
@@ -257,6 +266,10 @@ impl web::Machine for Insight {
         let reader = Reader::open(self.archive_folder().ok()?).ok()?;
         let picture = reader.entry(entry).ok()??.entry.picture;
         (!picture.is_empty()).then_some(picture)
+    }
+
+    fn bundle(&self) -> web::BundleFiles {
+        bundle::files(&self.config, &self.papers)
     }
 }
 
@@ -298,11 +311,16 @@ pub mod tests {
     use crate::plc::registers::RegisterImage;
     use crate::web::Machine;
 
-    /// Of a plain configuration.
-    pub fn insight() -> Insight {
+    /// A plain configuration.
+    pub fn config() -> Config {
         let config = "[camera]\ncalibration = \"c\"\n[belt]\nspeed_mm_per_s = 500\n\
             [zone]\nx_min_mm = -600\nx_max_mm = 600\ny_min_mm = -380\ny_max_mm = 380\n";
-        Insight::new(Config::parse(config).expect("valid"), [0; 2], 4)
+        Config::parse(config).expect("valid")
+    }
+
+    /// Of a plain configuration.
+    pub fn insight() -> Insight {
+        Insight::new(config(), Papers::default(), [0; 2], 4)
     }
 
     #[test]

@@ -2,17 +2,20 @@
 //! for the page and into the archive. Nobody waits for it.
 //!
 //! ```text
-//! vision -> [shots] -> desk -> Board: live pictures, parcels, events -> page
+//! vision -> [shots] -> desk -> Board: live pictures, parcels, events, trend -> page
 //!    ^-- [empty shots] --'  '-> archive's ring -> archive's thread -> disk
 //! PLC thread -> [published records] --^
 //! ```
 
+mod bundle;
 mod insight;
 mod lamps;
 mod news;
 mod scene;
 pub mod shots;
+mod trend;
 
+pub use bundle::Papers;
 pub use insight::{Insight, is_due};
 pub use shots::{Album, Photographer, Rings, Shot};
 
@@ -33,6 +36,7 @@ use std::collections::VecDeque;
 use std::sync::Arc;
 use std::sync::atomic::Ordering;
 use std::time::{Duration, Instant};
+use trend::Trend;
 
 /// The desk looks at what happens this often, woken or not.
 const LOOK: Duration = Duration::from_millis(50);
@@ -71,6 +75,7 @@ pub struct Desk<'a> {
     /// The last frames with a parcel that there was no room for a picture of.
     missed: Missed,
     news: News,
+    trend: Trend,
     looked: Option<Instant>,
 }
 
@@ -150,6 +155,7 @@ impl<'a> Desk<'a> {
             waiting: VecDeque::new(),
             missed: Missed::default(),
             news: News::new(Instant::now()),
+            trend: Trend::new(Instant::now()),
             looked: None,
         })
     }
@@ -178,8 +184,12 @@ impl<'a> Desk<'a> {
                 self.looked = Some(now);
                 let condition = self.archive.as_ref().map(Archive::condition);
                 self.insight.desk_tells(condition);
-                for event in self.news.look(&self.insight.plc_side(), utc_ms(), now) {
+                let plc = self.insight.plc_side();
+                for event in self.news.look(&plc, utc_ms(), now) {
                     self.happened(event);
+                }
+                if let Some(point) = self.trend.look(&plc, utc_ms(), now) {
+                    self.board.point(point);
                 }
             }
             if over {
@@ -276,6 +286,7 @@ impl<'a> Desk<'a> {
         if no_picture == Some(NoPicture::TooMany) {
             self.insight.pictures_missed.fetch_add(1, Ordering::Relaxed);
         }
+        self.trend.parcel(&record);
         self.insight.usable.fetch_add(u64::from(record.may_be_used), Ordering::Relaxed);
         // In descending order it is not known which side is the height.
         let is_upright = self.config.plc.order != DimensionOrder::Descending;

@@ -1,4 +1,4 @@
-// What happened since start, newest first.
+// What happened since start, newest first; and all of it for somebody elsewhere.
 
 import { askJson, every, h, has, t, time } from "./common.js";
 
@@ -11,6 +11,8 @@ export function events(main, signal) {
   main.append(h("section", { class: "card" }, h("h2", {}, t("events.title")),
     h("div", { class: "scroll" }, h("table", {},
       h("thead", {}, h("tr", {}, ["time", "what", "detail"].map((name) => h("th", { scope: "col" }, t(`events.${name}`))))), body)), empty));
+  main.append(h("section", { class: "card" }, h("h2", {}, t("bundle.title")), h("p", {}, t("bundle.what")), h("p", { class: "soft" }, t("bundle.secrets")),
+    h("p", {}, h("a", { href: "/api/bundle.tar.gz", download: "beltgauge-bundle.tar.gz" }, t("bundle.take")))));
   every(1000, signal, async () => {
     const list = await askJson(`/api/events?since=${since}`, signal);
     if (run !== null && run !== list.run) {

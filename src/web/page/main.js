@@ -5,8 +5,9 @@ import { events } from "./events.js";
 import { overview } from "./overview.js";
 import { parcel, parcels } from "./parcels.js";
 import { plc } from "./plc.js";
+import { trend } from "./trend.js";
 
-const PAGES = { overview, parcels, plc, events };
+const PAGES = { overview, parcels, trend, plc, events };
 // One of a list is part of it.
 const OTHERS = { parcel };
 const LIST_OF = { parcel: "parcels" };
@@ -86,6 +87,7 @@ element("theme").addEventListener("click", () => {
   theme = THEMES[(THEMES.indexOf(theme) + 1) % THEMES.length];
   remember("theme", theme);
   showTheme();
+  document.dispatchEvent(new Event("theme"));
 });
 element("language").addEventListener("click", async () => {
   await chooseLanguage(otherLanguage());

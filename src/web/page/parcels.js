@@ -45,6 +45,11 @@ export function parcelTable(signal, { title, most, filters }) {
 function archived(signal) {
   const body = h("tbody");
   const notice = h("p", { class: "soft" }, t("archive.hint"));
+  const missing = h("div", { class: "warning", role: "status" });
+  const [told, warn] = [new Set(), (place) => {
+    if (!told.has(place)) missing.append(h("p", {}, t("archive.unread", { place })));
+    told.add(place);
+  }];
   let before = null;
   const more = h("button", { type: "button", onclick: async () => {
     try {
@@ -52,6 +57,7 @@ function archived(signal) {
       for (const { entry, kind, what } of list.entries) {
         if (kind === "parcel") body.append(row(what, `archive/${entry}`));
       }
+      list.unread.forEach(warn);
       before = list.before;
       notice.textContent = before === null ? t("archive.end") : "";
       more.disabled = before === null;
@@ -59,7 +65,7 @@ function archived(signal) {
       notice.textContent = `${t("archive.unreadable")} ${error.message}`;
     }
   } }, t("archive.more"));
-  return h("section", { class: "card" }, h("h2", {}, t("archive.title")), table(body), notice, more);
+  return h("section", { class: "card" }, h("h2", {}, t("archive.title")), table(body), missing, notice, more);
 }
 
 function table(body) {
