@@ -5,12 +5,13 @@
 //! random number, allocates nothing: a recording replays to the same records on every run.
 
 mod gap;
+mod leaving;
 mod motion;
 mod records;
 mod sight;
 
+pub use leaving::Decision;
 pub use motion::Health;
-pub use records::doubts;
 pub use sight::Sight;
 
 use crate::belt::BeltPosition;
@@ -23,13 +24,17 @@ use crate::kernel::Level;
 use crate::kernel::scalar::bits::{self, Square, words};
 use crate::plan::{Block, Memory, Plan};
 use crate::stage::background::Background;
+use crate::stage::evidence::Evidence;
 use crate::stage::measure::{self, Frame, Measure, Measured};
 use crate::stage::odometry::{Expected, Motion, Odometry};
+use crate::stage::parcels::Rectangle;
+use crate::stage::passes::{Passed, Passes};
 use crate::stage::rectify::Rectify;
 use crate::stage::riders::Riders;
 use crate::stage::segment::{PxBox, Segment};
 use crate::stage::track::{Change, NOBODY, Phase, Track, Tracker};
 use crate::units::{BeltMm, BeltPx, BeltRect};
+use leaving::{Leaving, Silhouette, place_of};
 use motion::Witnesses;
 use nalgebra::Vector2;
 
@@ -74,6 +79,8 @@ pub struct Pipeline {
     riders: Riders,
     tracker: Tracker,
     measure: Measure,
+    passes: Passes,
+    leaving: Leaving,
     watch: Watch,
     /// Bit mask: parcels and their surroundings in the last frame.
     covered: Block<u64>,
@@ -100,6 +107,7 @@ impl Pipeline {
         Riders::plan(size, limits.blobs_max, plan);
         Tracker::plan(limits.tracks_max, limits.blobs_max, plan);
         Measure::plan(limits.tracks_max, limits.views_per_track_max, plan);
+        Passes::plan(&site.view, &site.config.zone, site.height_max_mm, plan);
         Watch::plan(site, plan);
         let mask = words(size[0]) * size[1];
         plan.add::<u64>("pipeline.covered", mask, "bit: parcel or near one in the last frame");
@@ -144,6 +152,15 @@ impl Pipeline {
             config.limits.views_per_track_max,
             memory,
         )?;
+        let passes = Passes::new(
+            view,
+            &zone,
+            site.height_max_mm,
+            measure::Rounding::of_radius(config.measure.edge_radius_mm),
+            level,
+            rectify.seen(),
+            memory,
+        )?;
         let watch = Watch::new(&site, memory)?;
         Ok(Self {
             rectify,
@@ -153,6 +170,8 @@ impl Pipeline {
             riders,
             tracker,
             measure,
+            passes,
+            leaving: Leaving::default(),
             watch,
             covered: memory.take("pipeline.covered", 0)?,
             hold: memory.take("pipeline.hold", 0)?,
@@ -199,26 +218,28 @@ impl Pipeline {
             let assumed_mm = self.odometry.speed().0 * dt_s;
             self.witnesses.encoder_alone(by_encoder, dt_s);
             self.at.advance(by_encoder.unwrap_or(assumed_mm), by_encoder.is_some());
+            self.follow_passes(time);
+            self.decide(false, emit);
             return Ok(());
         }
         let background = &self.background;
         self.segment.step(background.foreground(), background.strong(), background.dark());
         self.cover();
-        let motion = if gap {
-            self.bridge(by_encoder, time, dt_s, emit)
-        } else {
-            self.motion(by_encoder, dt_s)
-        };
+        let motion =
+            if gap { self.bridge(by_encoder, time, dt_s) } else { self.motion(by_encoder, dt_s) };
         self.at.advance(motion.step_mm, motion.measured);
         if gap {
-            self.depart(motion.step_mm, emit);
+            self.depart(motion.step_mm);
         }
         self.track(motion.step_mm);
         self.measure_tracks(time, motion.step_mm);
-        self.report(emit);
+        self.follow_passes(time);
+        self.leave_zone();
+        self.decide(false, emit);
         self.watch(raw, motion.step_mm, dt_s);
         self.counters.segment_overflows = self.segment.overflows;
-        self.counters.track_overflows = self.tracker.overflows;
+        self.counters.track_overflows =
+            self.tracker.overflows + self.leaving.overflows + self.passes.overflows();
         Ok(())
     }
 
@@ -253,6 +274,7 @@ impl Pipeline {
         self.tracker.forget();
         self.odometry.forget();
         self.riders.forget();
+        self.leaving.forget();
         self.stands_still = false;
     }
 
@@ -263,12 +285,14 @@ impl Pipeline {
 
     /// The input has ended: report what is still inside, flagged unfinished.
     pub fn finish(&mut self, emit: &mut dyn FnMut(ParcelRecord)) {
+        let Self { passes, leaving, .. } = self;
+        passes.finish(&mut |passed| leaving.add_pass(passed));
         for slot in 0..self.tracker.tracks().len() {
             if self.tracker.tracks()[slot].phase == Phase::Riding {
-                self.emit(slot, Flags::UNFINISHED, emit);
-                self.tracker.set_left(slot);
+                self.leave(slot, Flags::UNFINISHED);
             }
         }
+        self.decide(true, emit);
     }
 
     /// Not to be learned: parcels, or the whole belt at a standstill, when its texture and
@@ -375,24 +399,34 @@ impl Pipeline {
         }
     }
 
-    /// Emit what has passed the end of the zone, and what was lost on the way.
-    fn report(&mut self, emit: &mut dyn FnMut(ParcelRecord)) {
+    /// What rides over the belt, by its height.
+    fn follow_passes(&mut self, time: FrameTime) {
+        let Self { passes, leaving, .. } = self;
+        let mut add = |passed: &Passed| leaving.add_pass(passed);
+        passes.step(self.rectify.pixels(), self.at, time, &mut add);
+    }
+
+    /// Tracks that have passed the end of the zone, or were lost on the way.
+    fn leave_zone(&mut self) {
         for i in 0..self.tracker.changes().len() {
             let (slot, change) = self.tracker.changes()[i];
             if change == Change::Lost {
-                self.counters.lost += 1;
-                self.emit(slot, Flags::LOST, emit);
+                self.tell(slot, Flags::LOST, self.reason(slot, Flags::LOST));
             }
         }
         for slot in 0..self.tracker.tracks().len() {
-            if self.tracker.tracks()[slot].phase != Phase::Riding {
-                continue;
-            }
-            if self.trailing_x_mm(slot, 0.0) > self.zone.x_max_mm {
-                self.emit(slot, Flags::default(), emit);
-                self.tracker.set_left(slot);
+            if self.tracker.tracks()[slot].phase == Phase::Riding
+                && self.trailing_x_mm(slot, 0.0) > self.zone.x_max_mm
+            {
+                self.leave(slot, Flags::default());
             }
         }
+    }
+
+    /// A track's pass is over.
+    fn leave(&mut self, slot: usize, flags: Flags) {
+        self.tell(slot, flags, self.reason(slot, flags));
+        self.tracker.set_left(slot);
     }
 
     /// Where a parcel ends, by its cuboid, or by its image once that has moved on by `ahead_mm`.
@@ -404,9 +438,10 @@ impl Pipeline {
         self.site.view.belt_point(px).x + ahead_mm
     }
 
-    fn emit(&mut self, slot: usize, flags: Flags, emit: &mut dyn FnMut(ParcelRecord)) {
+    /// Why a track was not measured, if it was not.
+    fn reason(&self, slot: usize, flags: Flags) -> NotMeasured {
         let track = &self.tracker.tracks()[slot];
-        let reason = if self.at.breaks != track.first.breaks {
+        if self.at.breaks != track.first.breaks {
             NotMeasured::BeltMotionUnknown
         } else if flags.has(Flags::LOST) {
             NotMeasured::Lost
@@ -414,19 +449,12 @@ impl Pipeline {
             NotMeasured::NeverAlone
         } else {
             NotMeasured::TooBrief
-        };
-        self.tell(slot, flags, reason, emit);
+        }
     }
 
-    /// Emit a parcel, with this reason if it was not measured.
-    fn tell(
-        &mut self,
-        slot: usize,
-        flags: Flags,
-        reason: NotMeasured,
-        emit: &mut dyn FnMut(ParcelRecord),
-    ) {
-        if self.passed_beside(slot) || !self.reporting {
+    /// What a track's silhouettes showed, with this reason if that is no size.
+    fn tell(&mut self, slot: usize, flags: Flags, reason: NotMeasured) {
+        if self.passed_beside(slot) {
             return;
         }
         let reference = self.references[slot];
@@ -449,13 +477,18 @@ impl Pipeline {
         if vanished && !self.rode(slot) {
             return;
         }
-        self.counters.parcels += 1;
-        self.counters.unmeasured += u64::from(measured.is_none());
-        let record = match measured {
-            Some(measured) => self.record(slot, &measured, reference, flags),
-            None => self.record_without_size(slot, flags, reason),
+        let (record, place) = match measured {
+            Some(measured) => (
+                self.record_of_track(slot, &measured, reference, flags),
+                place_of(&measured.estimate.params, reference.at.travel_mm),
+            ),
+            None => (self.record_without_size(slot, flags, reason), self.place_of_image(slot)),
         };
-        emit(record.rounded());
+        let is_certain = record.not_measured.is_none()
+            && record.flags.is_empty()
+            && !self.passes.contradict(&place, record.height_mm);
+        let silhouette = Silhouette { record, place, is_certain };
+        self.leaving.add_silhouette(silhouette);
     }
 
     /// Whether something of these sides is as large as the smallest parcel.
@@ -484,6 +517,20 @@ impl Pipeline {
         self.site.view.belt_point(middle)
     }
 
+    /// The rectangle around a track's image on the belt.
+    fn place_of_image(&self, slot: usize) -> Rectangle {
+        let b = &self.tracker.tracks()[slot].bounds;
+        let middle = self.image_on_belt(slot);
+        let mm = |px: f32| f64::from(px) * self.site.view.mm_per_px;
+        Rectangle {
+            x_mm: middle.x - self.at.travel_mm,
+            y_mm: middle.y,
+            length_mm: mm(b.u1 - b.u0),
+            width_mm: mm(b.v1 - b.v0),
+            ..Rectangle::default()
+        }
+    }
+
     /// Whether nothing of a parcel was in the zone.
     fn passed_beside(&self, slot: usize) -> bool {
         let beside = |y_mm: &[f64]| {
@@ -502,6 +549,16 @@ impl Pipeline {
         tracks
             .filter(|(_, t)| t.phase == Phase::Riding)
             .map(|(slot, _)| (slot, self.references[slot].time.index))
+    }
+
+    /// What was told in the last frame, and what it was decided from.
+    pub fn decisions(&self) -> &[Decision] {
+        &self.leaving.decisions
+    }
+
+    /// Heights of the belt.
+    pub fn evidence(&self) -> &Evidence {
+        self.passes.evidence()
     }
 
     /// What happened so far.

@@ -6,14 +6,10 @@ mod common;
 use beltgauge::archive::Reader;
 use beltgauge::config::{Config, Site};
 use beltgauge::error::Result;
-use beltgauge::image::{FrameTime, Plane};
-use beltgauge::kernel::Level;
-use beltgauge::plan::Plan;
-use beltgauge::run::{Appliance, demo};
+use beltgauge::image::FrameTime;
+use beltgauge::run::{Appliance, demo, plan};
 use beltgauge::source::synthetic::{Scenario, Synthetic};
 use beltgauge::source::{FrameSource, Pace, Paced};
-use beltgauge::stage::measure::Rounding;
-use beltgauge::stage::passes::Passes;
 use std::alloc::{GlobalAlloc, Layout, System};
 use std::io::{Read, Write};
 use std::net::{SocketAddr, TcpStream};
@@ -192,42 +188,6 @@ fn long_belt(width: usize, frames: u64) -> (Synthetic, Site) {
     (Synthetic::new(scenario).expect("renders"), site)
 }
 
-/// Measure whole passes of the demo's belt on a thread called vision; returns parcels and allocations.
-fn run_passes() -> (usize, u64) {
-    let (mut belt, site) = demo_belt();
-    VISION.store(0, Ordering::Relaxed);
-    let measure = move || {
-        let (view, zone, height_max_mm) = (site.view.clone(), site.config.zone, site.height_max_mm);
-        let (mut frames, mut pipeline) = beltgauge::run::build(site).expect("fits");
-        let mut plan = Plan::default();
-        Passes::plan(&view, &zone, height_max_mm, &mut plan);
-        let mut memory = plan.reserve(512).expect("fits");
-        let (rounding, level) = (Rounding::of_radius(0.0), Level::new());
-        let seen = pipeline.seen();
-        let mut passes =
-            Passes::new(&view, &zone, height_max_mm, rounding, level, seen, &mut memory)
-                .expect("planned");
-        let [width, height] = belt.size_px();
-        let mut parcels = 0;
-        for _ in 0..500 {
-            let Some(time) = belt.next_into(&mut frames[0]).expect("renders") else { break };
-            let raw = Plane::packed(&frames[0], width, height).expect("its size");
-            ARMED.store(true, Ordering::Relaxed);
-            pipeline.step(raw, time, &mut |_| ()).expect("its size");
-            let at = pipeline.belt_position();
-            passes.step(pipeline.pixels(), at, time, &mut |_| parcels += 1);
-            ARMED.store(false, Ordering::Relaxed);
-        }
-        ARMED.store(true, Ordering::Relaxed);
-        passes.finish(&mut |_| parcels += 1);
-        ARMED.store(false, Ordering::Relaxed);
-        parcels
-    };
-    let thread = std::thread::Builder::new().name("vision".into()).spawn(measure);
-    let parcels = thread.expect("a thread").join().expect("no panic");
-    (parcels, VISION.load(Ordering::Relaxed))
-}
-
 /// One test: the counters are the process's.
 #[test]
 fn ten_thousand_frames_with_parcels_allocate_nothing_and_memory_stays_as_it_was_planned() {
@@ -235,12 +195,16 @@ fn ten_thousand_frames_with_parcels_allocate_nothing_and_memory_stays_as_it_was_
     let (mut belt, site) = long_belt(1920, 100);
     belt.render(0, &mut vec![0; 1920 * 1200]);
     let renderer_kib = resident_kib() - base_kib;
+    let planned_kib = plan(&site).bytes() as u64 / 1024;
     let mut source = Watched::new(belt, 90);
     let (_, capture, vision) = run(&mut source, site, 1, 0);
     assert_eq!((capture, vision), (0, 0), "allocations at the full size");
     let appliance_kib = source.resident_kib[1] - renderer_kib;
-    eprintln!("resident at 1920x1200: {appliance_kib} KiB besides the renderer's {renderer_kib}");
-    assert!(appliance_kib * 1024 < 64_000_000, "{appliance_kib} KiB");
+    eprintln!(
+        "resident at 1920x1200: {appliance_kib} KiB of {planned_kib} planned, renderer {renderer_kib}"
+    );
+    // What is not planned: program, stacks, servers, the page's last pictures.
+    assert!(appliance_kib < planned_kib + 48 * 1024, "{appliance_kib} of {planned_kib} KiB");
     drop(source);
 
     let (belt, mut site) = long_belt(320, 10_100);
@@ -267,9 +231,6 @@ fn ten_thousand_frames_with_parcels_allocate_nothing_and_memory_stays_as_it_was_
     assert_eq!((capture, vision), (0, 0), "allocations with two workers and eight viewers");
     let pictures = PICTURES.load(Ordering::Relaxed);
     assert!(pictures >= 16, "the viewers got only {pictures} pictures: the test proves nothing");
-    let (parcels, vision) = run_passes();
-    assert!(parcels >= 5, "only {parcels} whole passes: the test proves nothing");
-    assert_eq!(vision, 0, "allocations by whole passes");
     // The counter counts: one allocation and one release a frame while armed.
     let (belt, site) = demo_belt();
     let mut leaking = Watched { leak: true, ..Watched::new(belt, 510) };

@@ -269,7 +269,7 @@ pub struct Limits {
 impl Default for Limits {
     fn default() -> Self {
         Self {
-            memory_mib_max: 256,
+            memory_mib_max: 768,
             tracks_max: 16,
             runs_max: 16384,
             blobs_max: 512,

@@ -8,20 +8,14 @@
 //! show to be new, and looks like a parcel from before, is that parcel, and is told once, when it leaves.
 
 use super::{Pipeline, Reference};
-use crate::event::{Flags, NotMeasured, ParcelRecord};
+use crate::event::{Flags, NotMeasured};
 use crate::image::FrameTime;
 use crate::stage::odometry::{Across, Motion};
 use crate::stage::track::{Phase, Seen};
 
 impl Pipeline {
     /// The belt's step over a gap of `dt_s`, which may be anything.
-    pub(super) fn bridge(
-        &mut self,
-        by_encoder: Option<f64>,
-        time: FrameTime,
-        dt_s: f64,
-        emit: &mut dyn FnMut(ParcelRecord),
-    ) -> Motion {
+    pub(super) fn bridge(&mut self, by_encoder: Option<f64>, time: FrameTime, dt_s: f64) -> Motion {
         let grey = self.rectify.pixels();
         let seen = self.odometry.across(grey, &self.background, &self.covered, dt_s);
         self.riders.forget();
@@ -30,7 +24,7 @@ impl Pipeline {
             .map(|step_mm| Motion { step_mm, measured: true })
             .or_else(|| self.seen_over_gap(seen, dt_s))
             .unwrap_or_else(|| {
-                self.lose_belt(seen, time, dt_s, emit);
+                self.lose_belt(seen, time, dt_s);
                 Motion { step_mm: 0.0, measured: false }
             });
         self.stands_still &= motion.step_mm.abs() < self.site.view.mm_per_px;
@@ -57,13 +51,7 @@ impl Pipeline {
     }
 
     /// Nothing is known of the travel.
-    fn lose_belt(
-        &mut self,
-        seen: Across,
-        time: FrameTime,
-        dt_s: f64,
-        emit: &mut dyn FnMut(ParcelRecord),
-    ) {
+    fn lose_belt(&mut self, seen: Across, time: FrameTime, dt_s: f64) {
         let before = self.at;
         self.at.lose();
         let travel_max_mm = self.odometry.travel_max_mm(dt_s);
@@ -86,9 +74,8 @@ impl Pipeline {
                         Reference { began_s: time.t_s, time, at: self.at, fixed: false };
                 }
                 (Phase::Riding, None) => {
-                    self.counters.lost += 1;
                     let at = std::mem::replace(&mut self.at, before);
-                    self.tell(slot, Flags::LOST, NotMeasured::BeltMotionUnknown, emit);
+                    self.tell(slot, Flags::LOST, NotMeasured::BeltMotionUnknown);
                     self.at = at;
                     self.tracker.drop_track(slot);
                 }
@@ -104,12 +91,11 @@ impl Pipeline {
     }
 
     /// Tell what the gap has carried out of the zone, before it is looked for in the picture.
-    pub(super) fn depart(&mut self, step_mm: f64, emit: &mut dyn FnMut(ParcelRecord)) {
+    pub(super) fn depart(&mut self, step_mm: f64) {
         for slot in 0..self.tracker.tracks().len() {
             let rides = self.tracker.tracks()[slot].phase == Phase::Riding;
             if rides && self.trailing_x_mm(slot, step_mm) > self.zone.x_max_mm {
-                self.emit(slot, Flags::default(), emit);
-                self.tracker.set_left(slot);
+                self.leave(slot, Flags::default());
             }
         }
     }

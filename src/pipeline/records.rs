@@ -4,7 +4,9 @@ use super::{Pipeline, Reference};
 use crate::config::Site;
 use crate::event::{Flags, NotMeasured, ParcelRecord, Shape};
 use crate::image::FrameTime;
-use crate::stage::measure::{self, Measured};
+use crate::stage::measure::{self, Measured, canonical_estimate};
+use crate::stage::passes::Passed;
+use crate::stage::views::Kept;
 
 /// Above this relative sigma the belt speed counts as assumed.
 const SPEED_SIGMA_MAX: f64 = 0.01;
@@ -20,7 +22,7 @@ impl Pipeline {
         let position = self.image_on_belt(slot);
         let now = self.last.unwrap_or(FrameTime { index: 0, t_s: 0.0 });
         ParcelRecord {
-            seq: self.counters.parcels as u32,
+            seq: 0,
             frame: now.index,
             t_s: now.t_s,
             length_mm: 0.0,
@@ -42,7 +44,8 @@ impl Pipeline {
         }
     }
 
-    pub(super) fn record(
+    /// What the silhouettes of a track showed.
+    pub(super) fn record_of_track(
         &self,
         slot: usize,
         measured: &Measured,
@@ -50,13 +53,37 @@ impl Pipeline {
         flags: Flags,
     ) -> ParcelRecord {
         let track = &self.tracker.tracks()[slot];
-        let (p, s) = (&measured.estimate.params, &measured.estimate.sigma);
-        let travel_sigma = self.at.sigma_since(&track.first);
         let elapsed_s = self.last.map_or(0.0, |last| last.t_s - reference.began_s);
         let travel_mm = self.at.travel_mm - track.first.travel_mm;
-        let shape = if measured.is_box { Shape::Box } else { Shape::Irregular };
+        let scale = measured.estimate.params[measure::SCALE];
         let mut record = ParcelRecord {
-            seq: self.counters.parcels as u32,
+            belt_speed_mm_per_s: scale * travel_mm / elapsed_s.max(1e-9),
+            flags,
+            ..self.record(measured, Kept { at: reference.at, time: reference.time })
+        };
+        record.flags.set(doubts(&self.site, measured, self.at.sigma_since(&track.first)), true);
+        record.flags.set(Flags::MERGED, track.was_merged());
+        record
+    }
+
+    /// What the heights of a pass showed.
+    pub(super) fn record_of_pass(&self, passed: &Passed) -> ParcelRecord {
+        let mut measured = passed.measured;
+        measured.estimate = canonical_estimate(measured.estimate);
+        let mut record = ParcelRecord {
+            belt_speed_mm_per_s: passed.speed_mm_per_s(),
+            flags: doubts(&self.site, &measured, passed.travel_sigma()),
+            ..self.record(&measured, passed.reference)
+        };
+        record.flags.set(Flags::UNFINISHED, !passed.left);
+        record
+    }
+
+    /// A cuboid where it was in a view, without a doubt, a number and the belt's speed.
+    fn record(&self, measured: &Measured, reference: Kept) -> ParcelRecord {
+        let (p, s) = (&measured.estimate.params, &measured.estimate.sigma);
+        ParcelRecord {
+            seq: 0,
             frame: reference.time.index,
             t_s: reference.time.t_s,
             length_mm: p[measure::LENGTH],
@@ -68,24 +95,19 @@ impl Pipeline {
             sigma_length_mm: s[measure::LENGTH],
             sigma_width_mm: s[measure::WIDTH],
             sigma_height_mm: s[measure::HEIGHT],
-            belt_speed_mm_per_s: p[measure::SCALE] * travel_mm / elapsed_s.max(1e-9),
-            shape,
-            flags,
+            belt_speed_mm_per_s: 0.0,
+            shape: if measured.is_box { Shape::Box } else { Shape::Irregular },
+            flags: Flags::default(),
             not_measured: None,
             may_be_used: false,
             belt_travel_mm: reference.at.travel_mm,
             by_encoder: self.by_encoder(),
-        };
-        record.flags.set(doubts(&self.site, measured, travel_sigma), true);
-        record.flags.set(Flags::MERGED, track.was_merged());
-        // A standard deviation above the limit is a flag too.
-        record.may_be_used = record.flags.is_empty() && self.condition().is_fit();
-        record
+        }
     }
 }
 
 /// What casts doubt on a cuboid. `travel_sigma`: relative, of the belt's travel over its pass.
-pub fn doubts(site: &Site, measured: &Measured, travel_sigma: f64) -> Flags {
+fn doubts(site: &Site, measured: &Measured, travel_sigma: f64) -> Flags {
     let (p, s) = (&measured.estimate.params, &measured.estimate.sigma);
     let sigma_max_mm = site.config.measure.sigma_max_mm;
     let footprint_sigma_mm = s[measure::LENGTH].max(s[measure::WIDTH]);

@@ -1,20 +1,12 @@
-//! A second opinion on a recording: heights by known motion over the whole pass, decided at its end.
+//! Why each parcel of a recording was told as it was.
 //!
-//! It runs beside the pipeline, from the same belt views and belt positions, and decides nothing for
-//! it. Written are its records, one JSON line a parcel, and a picture of the evidence: the belt from above, each
-//! cell with its height, blue low to red high.
+//! Written are, one JSON line a parcel, its record with what each witness showed of it, and a picture of the heights:
+//! the belt from above, each cell with its height, blue low to red high.
 
-use crate::config::Site;
 use crate::error::{Error, Result};
-use crate::event::{Flags, ParcelRecord, Shape};
-use crate::image::FrameTime;
-use crate::kernel::Level;
-use crate::pipeline::{Pipeline, doubts};
-use crate::plan::Plan;
-use crate::stage::measure::{self, Measured, Rounding, canonical_estimate};
-use crate::stage::parcels::Face;
-use crate::stage::passes::{Passed, Passes};
-use crate::stage::views::Kept;
+use crate::pipeline::{Decision, Pipeline};
+use crate::stage::evidence::Evidence;
+use crate::stage::passes::Passed;
 use image::{Rgb, RgbImage};
 use std::io::Write;
 use std::path::{Path, PathBuf};
@@ -24,11 +16,9 @@ const PICTURE_COLUMNS_MAX: usize = 20_000;
 /// Pixels of a picture's cell.
 const PICTURE_PX: u32 = 2;
 
-/// The second opinion.
+/// The reasons of a recording.
 pub struct Explainer {
     folder: PathBuf,
-    passes: Passes,
-    /// As JSON: each record, and what it was decided from.
     records: Vec<serde_json::Value>,
     /// Heights of the columns decided, and the next one's number.
     picture: Vec<Vec<Option<f32>>>,
@@ -37,35 +27,25 @@ pub struct Explainer {
 
 impl Explainer {
     /// Results go to `folder`, which is created.
-    pub fn new(folder: &Path, pipeline: &Pipeline) -> Result<Self> {
+    pub fn new(folder: &Path) -> Result<Self> {
         std::fs::create_dir_all(folder).map_err(|e| {
             Error::failure(format!("cannot create the folder: {e}")).in_file(folder)
         })?;
-        let site = pipeline.site();
-        let (view, zone, height_max_mm) = (&site.view, &site.config.zone, site.height_max_mm);
-        let mut plan = Plan::default();
-        Passes::plan(view, zone, height_max_mm, &mut plan);
-        let mib = plan.bytes().div_ceil(1 << 20);
-        let mut memory = plan.reserve(mib)?;
-        let rounding = Rounding::of_radius(site.config.measure.edge_radius_mm);
-        let (level, seen) = (Level::new(), pipeline.seen());
-        let passes = Passes::new(view, zone, height_max_mm, rounding, level, seen, &mut memory)?;
-        memory.seal()?;
-        let (folder, records, picture) = (folder.to_owned(), Vec::new(), Vec::new());
-        Ok(Self { folder, passes, records, picture, pictured: 0 })
+        Ok(Self {
+            folder: folder.to_owned(),
+            records: Vec::new(),
+            picture: Vec::new(),
+            pictured: 0,
+        })
     }
 
-    /// A frame more, after the pipeline's step.
-    pub fn frame(&mut self, pipeline: &Pipeline, time: FrameTime) {
-        let Self { passes, records, .. } = self;
-        let mut emit =
-            |passed: &Passed| records.extend(told(pipeline.site(), passed, records.len()));
-        passes.step(pipeline.pixels(), pipeline.belt_position(), time, &mut emit);
-        self.draw();
+    /// A frame more, after the pipeline's step, or its end.
+    pub fn frame(&mut self, pipeline: &Pipeline) {
+        self.records.extend(pipeline.decisions().iter().filter_map(reasons));
+        self.draw(pipeline.evidence());
     }
 
-    fn draw(&mut self) {
-        let evidence = self.passes.evidence();
+    fn draw(&mut self, evidence: &Evidence) {
         let decided = evidence.decided();
         if self.picture.is_empty() {
             self.pictured = decided.start;
@@ -80,15 +60,8 @@ impl Explainer {
         }
     }
 
-    /// The end of the recording: what is left, and the files.
-    pub fn finish(mut self, pipeline: &Pipeline) -> Result<()> {
-        let Self { passes, records, .. } = &mut self;
-        passes.finish(&mut |passed| records.extend(told(pipeline.site(), passed, records.len())));
-        let overflows = passes.overflows();
-        if overflows > 0 {
-            tracing::warn!("{overflows} parcels more than the second opinion has room for");
-        }
-        self.draw();
+    /// The end of the recording: the files.
+    pub fn finish(self, pipeline: &Pipeline) -> Result<()> {
         let path = self.folder.join("parcels.jsonl");
         let io = |e: std::io::Error| Error::failure(format!("cannot write: {e}")).in_file(&path);
         let mut file = std::fs::File::create(&path).map_err(io)?;
@@ -105,20 +78,21 @@ impl Explainer {
 }
 
 /// A parcel's record, and what it was decided from.
-fn told(site: &Site, passed: &Passed, before: usize) -> Option<serde_json::Value> {
-    let Passed { face, measured, travel_sigma, newest } = passed;
-    let mut record = record_of(measured, *newest, before as u32 + 1);
-    record.flags.set(doubts(site, measured, *travel_sigma), true);
-    let mut told = serde_json::to_value(record.rounded()).ok()?;
-    let share = (1e3 * measured.estimate.edge_share).round() / 1e3;
-    told["edge_share"] = share.into();
-    told["edges"] = measured.estimate.edge_count.into();
-    told["face"] = told_of(face);
+fn reasons(decision: &Decision) -> Option<serde_json::Value> {
+    let mut told = serde_json::to_value(decision.record).ok()?;
+    if let Some(silhouettes) = decision.silhouettes {
+        told["silhouettes"] = serde_json::to_value(silhouettes.rounded()).ok()?;
+    }
+    if let Some((heights, passed)) = &decision.heights {
+        told["heights"] = serde_json::to_value(heights.rounded()).ok()?;
+        told["face"] = reasons_of(passed);
+    }
     Some(told)
 }
 
-/// What the evidence showed of a top face, before edges were fitted.
-fn told_of(face: &Face) -> serde_json::Value {
+/// What was seen of a top face, and the edges that were fitted to it.
+fn reasons_of(passed: &Passed) -> serde_json::Value {
+    let (face, estimate) = (&passed.face, &passed.measured.estimate);
     let tenths = |value: f64| (10.0 * value).round() / 10.0;
     serde_json::json!({
         "length_mm": tenths(face.rectangle.length_mm),
@@ -129,35 +103,9 @@ fn told_of(face: &Face) -> serde_json::Value {
         "sides": face.rectangle.sides.map(|share| (1e2 * share).round() / 1e2),
         "cells": face.cells,
         "is_cuboid": face.is_cuboid,
+        "edges": estimate.edge_count,
+        "edge_share": (1e3 * estimate.edge_share).round() / 1e3,
     })
-}
-
-fn record_of(measured: &Measured, kept: Kept, seq: u32) -> ParcelRecord {
-    let estimate = canonical_estimate(measured.estimate);
-    let (p, s) = (&estimate.params, &estimate.sigma);
-    let shape = if measured.is_box { Shape::Box } else { Shape::Irregular };
-    ParcelRecord {
-        seq,
-        frame: kept.time.index,
-        t_s: kept.time.t_s,
-        length_mm: p[measure::LENGTH],
-        width_mm: p[measure::WIDTH],
-        height_mm: p[measure::HEIGHT],
-        yaw_deg: p[measure::YAW].to_degrees(),
-        x_mm: p[measure::X],
-        y_mm: p[measure::Y],
-        sigma_length_mm: s[measure::LENGTH],
-        sigma_width_mm: s[measure::WIDTH],
-        sigma_height_mm: s[measure::HEIGHT],
-        belt_speed_mm_per_s: 0.0,
-        shape,
-        flags: Flags::default(),
-        not_measured: None,
-        // A second opinion: nobody may sort by it.
-        may_be_used: false,
-        belt_travel_mm: kept.at.travel_mm,
-        by_encoder: false,
-    }
 }
 
 fn paint(columns: &[Vec<Option<f32>>], height_max_mm: f32) -> RgbImage {

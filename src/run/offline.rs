@@ -58,7 +58,7 @@ pub fn measure(
     site.check_image_size([width, height])?;
     let mut annotator = outputs.annotate.map(|f| Annotator::new(f, [width, height])).transpose()?;
     let (mut frames, mut pipeline) = memory::build(site)?;
-    let mut explainer = outputs.explain.map(|f| Explainer::new(f, &pipeline)).transpose()?;
+    let mut explainer = outputs.explain.map(Explainer::new).transpose()?;
     let mut frame = frames.pop().ok_or_else(|| Error::failure("no frame was planned"))?;
     // Only now: an earlier run's records survive a start that fails.
     let mut lines = outputs.jsonl.map(JsonLines::create).transpose()?;
@@ -75,7 +75,7 @@ pub fn measure(
                     .ok_or_else(|| Error::failure("a frame of another size"))?;
                 pipeline.step(raw, time, &mut |r| records.push(r))?;
                 if let Some(explainer) = &mut explainer {
-                    explainer.frame(&pipeline, time);
+                    explainer.frame(&pipeline);
                 }
                 None
             }
@@ -107,7 +107,8 @@ pub fn measure(
             if let Some(doubt) = condition_doubt(&pipeline.condition()) {
                 observer.doubt(&doubt);
             }
-            if let Some(explainer) = explainer {
+            if let Some(mut explainer) = explainer {
+                explainer.frame(&pipeline);
                 explainer.finish(&pipeline)?;
             }
             result?;

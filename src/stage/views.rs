@@ -1,8 +1,8 @@
 //! The belt views of the last passes: what the evidence and the fit look back at.
 //!
 //! In: the belt view of each frame, with the belt's position. Out: views about evenly spaced over the
-//! belt's travel, newest first. Owns: the pictures. Limits: [`VIEWS_MAX`] views, over [`ZONES`] zones of
-//! travel; the oldest make room.
+//! belt's travel, newest first. Owns: the pictures. Limits: [`VIEWS_MAX`] views, the oldest make
+//! room.
 
 use crate::belt::BeltPosition;
 use crate::camera::BeltView;
@@ -14,10 +14,8 @@ use crate::units::BeltRect;
 
 /// Views that a pass over the zone gives: more repeat what is known.
 const VIEWS_PER_ZONE: usize = 40;
-/// Zones of travel looked back at: a parcel as long as the zone is seen whole.
-const ZONES: usize = 2;
-/// Views kept.
-pub const VIEWS_MAX: usize = VIEWS_PER_ZONE * ZONES;
+/// Views kept, over a zone of travel and a quarter: of a parcel up to that quarter long those that show any of it.
+pub const VIEWS_MAX: usize = VIEWS_PER_ZONE + VIEWS_PER_ZONE / 4;
 
 /// Measured travel after which what was only assumed before is set right, share of the zone: 0.05 % of
 /// the speed, by steps that are good to 0.05 mm.
@@ -55,7 +53,7 @@ impl Views {
         plan.add::<u8>(
             "views.grey",
             stride(width) * height * VIEWS_MAX,
-            "belt views over two zones of travel",
+            "belt views over a zone of travel and a quarter",
         );
         plan.add::<Kept>("views.kept", VIEWS_MAX, "the belt's position in each");
     }

@@ -296,6 +296,14 @@ impl Measure {
         Some(Outline::new(&self.geometry, &estimate.params, at.travel_mm - pass.first.travel_mm))
     }
 
+    /// The cuboid at belt position `at` by the current estimate, as parameters.
+    pub fn params(&self, slot: usize, at: BeltPosition) -> Option<Params> {
+        let pass = &self.passes[slot];
+        let mut params = pass.estimate.as_ref()?.params;
+        params[X] += params[SCALE] * (at.travel_mm - pass.first.travel_mm);
+        Some(params)
+    }
+
     /// The final estimate, X at belt position `at`, length >= width.
     pub fn finish(&mut self, slot: usize, at: BeltPosition) -> Option<Measured> {
         // Nothing is left of a pass that ends as expected.

@@ -5,13 +5,12 @@ use super::fit::{DISPUTED_SIGMA, Estimate, GATES_PX, Problem, Silhouette};
 use super::model::{HEIGHT, LENGTH, Outline, Params, Rounding, SCALE, WIDTH, X, Y, YAW};
 use super::observe::{Frame, PassView};
 use super::{BOX_EDGE_SHARE_MIN, EDGE_COUNT_MIN, Measured};
-use crate::belt::BeltPosition;
 use crate::camera::BeltView;
 use crate::error::Result;
 use crate::kernel::scalar::bits::words;
 use crate::plan::{Block, Memory, Plan};
 use crate::stage::parcels::{Cuboid, Face, Rectangle};
-use crate::stage::views::{VIEWS_MAX, Views};
+use crate::stage::views::{Kept, VIEWS_MAX, Views};
 use crate::units::BeltRect;
 
 /// A face's height from the evidence is good to this, mm.
@@ -68,9 +67,9 @@ impl WholePass {
     }
 
     /// Measure the parcel of a face from the views of its pass; X holds at the newest view's belt position. With it the
-    /// relative standard uncertainty of the belt's travel over the pass. None if the face is a cuboid's and the edges, now
-    /// that all are seen, are none. What is no cuboid is as large as the face found of it.
-    pub fn measure(&mut self, views: &Views, face: &Face) -> Option<(Measured, f64)> {
+    /// first view that has any of it. None if the face is a cuboid's and the edges, now that all are seen, are none. What
+    /// is no cuboid is as large as the face found of it.
+    pub fn measure(&mut self, views: &Views, face: &Face) -> Option<(Measured, Kept)> {
         if face.is_cuboid {
             let mut fitted = self.fit(views, face).filter(|(measured, _)| measured.is_box)?;
             // It was over the belt by the views until then.
@@ -101,8 +100,8 @@ impl WholePass {
     }
 
     /// Fit a cuboid. Of the borders that may be the face's, that one which most edges confirm.
-    fn fit(&mut self, views: &Views, face: &Face) -> Option<(Measured, f64)> {
-        let share = |(measured, _): &(Measured, f64)| measured.estimate.edge_share;
+    fn fit(&mut self, views: &Views, face: &Face) -> Option<(Measured, Kept)> {
+        let share = |(measured, _): &(Measured, Kept)| measured.estimate.edge_share;
         let mut fit = |border, rounds| self.fit_border(views, border, face.height_mm, rounds);
         let mut best = fit(&face.rectangle, ROUNDS_AGAIN);
         for border in face.narrower.iter().flatten() {
@@ -114,7 +113,7 @@ impl WholePass {
         best
     }
 
-    fn enclose(&mut self, views: &Views, face: &Face) -> Option<(Measured, f64)> {
+    fn enclose(&mut self, views: &Views, face: &Face) -> Option<(Measured, Kept)> {
         let newest = views.kept(views.newest()?).at;
         let params = Self::params_of(&face.rectangle, face.height_mm, newest.travel_mm);
         let (_, first) = self.look(views, &params, newest.travel_mm);
@@ -132,7 +131,7 @@ impl WholePass {
             reach_error: 0.0,
         };
         let measured = Measured { estimate, is_box: false, has_edges: true, disputed: false };
-        Some((measured, newest.sigma_since(&first?)))
+        Some((measured, first?))
     }
 
     /// The cuboid of a face when the belt has travelled so far.
@@ -154,7 +153,7 @@ impl WholePass {
         border: &Rectangle,
         height_mm: f64,
         rounds: usize,
-    ) -> Option<(Measured, f64)> {
+    ) -> Option<(Measured, Kept)> {
         let newest = views.kept(views.newest()?).at;
         let mut params = Self::params_of(border, height_mm, newest.travel_mm);
         let m = self.geometry.magnification(height_mm);
@@ -173,11 +172,11 @@ impl WholePass {
             top_motion: Some(TopMotion { ratio: m, sigma, highest: m }),
             view_stride: 1,
         };
-        let mut best: Option<Estimate> = None;
+        let mut best: Option<(Estimate, Kept)> = None;
         for round in 0..rounds {
             let (count, first) = self.look(views, &params, newest.travel_mm);
-            let pass = &self.pass[..count];
-            problem.travel_sigma = newest.sigma_since(&first?);
+            let (pass, first) = (&self.pass[..count], first?);
+            problem.travel_sigma = newest.sigma_since(&first.at);
             let fitted = if round == 0 {
                 problem.refine_edges(pass, params, &GATES_PX)
             } else {
@@ -185,9 +184,9 @@ impl WholePass {
             };
             let Some(fitted) = fitted else { break };
             params = fitted.params;
-            best = Some(fitted);
+            best = Some((fitted, first));
         }
-        let estimate = best.filter(|estimate| estimate.edge_count > 0)?;
+        let (estimate, first) = best.filter(|(estimate, _)| estimate.edge_count > 0)?;
         // What has shrunk to a line was one: the border of a shadow, a seam.
         if estimate.params[LENGTH].min(estimate.params[WIDTH]) < LINE_MM {
             return None;
@@ -196,17 +195,17 @@ impl WholePass {
         let is_box = estimate.edge_share >= BOX_EDGE_SHARE_MIN;
         let off_mm = (estimate.params[HEIGHT] - height_mm).abs();
         let disputed = off_mm > DISPUTED_SIGMA * FACE_HEIGHT_SIGMA_MM.hypot(estimate.sigma[HEIGHT]);
-        Some((Measured { estimate, is_box, has_edges, disputed }, problem.travel_sigma))
+        Some((Measured { estimate, is_box, has_edges, disputed }, first))
     }
 
     /// Take profiles across a cuboid's edges in every view that has any of it in the zone. Returns how many these are,
-    /// and where the belt was in the first of them.
+    /// and the first of them.
     fn look(
         &mut self,
         views: &Views,
         params: &Params,
         reference_travel_mm: f64,
-    ) -> (usize, Option<BeltPosition>) {
+    ) -> (usize, Option<Kept>) {
         let (mut count, mut first) = (0, None);
         for place in views.places() {
             let travel_mm = views.kept(place).at.travel_mm;
@@ -224,7 +223,7 @@ impl WholePass {
             frame.sample_edges(&outline, view);
             if !view.samples().is_empty() {
                 count += 1;
-                first = Some(views.kept(place).at);
+                first = Some(views.kept(place));
             }
         }
         (count, first)

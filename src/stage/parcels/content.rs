@@ -14,6 +14,8 @@ pub const HIGHEST_SHARE: f64 = 0.95;
 const BORDER_LEVEL_MIN: f64 = 0.2;
 /// On a parcel at most this many cells for one that is raised lie on the belt.
 const BELT_SHARE_MAX: f64 = 0.3;
+/// The belt was seen at a place when this share of the cells tells it: that many scatter on to it from other heights.
+const BELT_SEEN_MIN: f64 = 0.05;
 /// Of the cells on a flat face so many are higher: they scatter.
 const HIGHER_MAX: f64 = 0.05;
 /// What has no top face is full of raised cells: this share.
@@ -44,6 +46,11 @@ impl Content {
     /// Whether the belt shows within.
     pub fn is_belt(&self) -> bool {
         self.on_belt >= BELT_SHARE_MAX * self.raised
+    }
+
+    /// Whether the belt shows within, and enough of it to say so.
+    pub fn shows_belt(&self) -> bool {
+        self.on_belt > BELT_SEEN_MIN && self.is_belt()
     }
 
     /// Whether nothing is beyond a face that is too flat for cells to tell it from the belt.

@@ -53,6 +53,12 @@ pub struct Cuboid {
 }
 
 impl Face {
+    /// A cuboid's top face over a place.
+    pub fn cuboid(place: &Rectangle, height_mm: f64) -> Self {
+        let (narrower, cells, is_cuboid) = ([None; 4], 0, true);
+        Self { rectangle: *place, narrower, height_mm, cells, is_cuboid }
+    }
+
     /// What the face explains: its border beyond what an accident has.
     pub fn worth(&self) -> f64 {
         let border_mm = 2.0 * (self.rectangle.length_mm + self.rectangle.width_mm);
@@ -65,9 +71,14 @@ impl Face {
             && self.rectangle.outside_mm(x_mm, y_mm) < SIDE_MM
     }
 
-    /// Whether it is too near to the belt for cells to tell one from the other, and a whole border tells it.
+    /// Whether it is too near to the belt for cells to tell one from the other.
+    pub fn is_low(&self) -> bool {
+        self.height_mm < FLAT_MM
+    }
+
+    /// Whether it is as low, and a whole border tells it.
     pub fn is_flat(&self) -> bool {
-        self.height_mm < FLAT_MM && self.rectangle.support() > FLAT_SUPPORT_MIN
+        self.is_low() && self.rectangle.support() > FLAT_SUPPORT_MIN
     }
 
     /// Whether two faces have one border at one height.

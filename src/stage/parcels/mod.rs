@@ -165,6 +165,25 @@ impl Parcels {
         self.gone.clear();
     }
 
+    /// Whether a face on its way to the zone's end, and a place, lie on each other.
+    pub fn waits_at(&self, place: &Rectangle) -> bool {
+        self.waiting.iter().any(|face| face.rectangle.overlaps(place))
+    }
+
+    /// Whether the cells at a place tell the belt rather than something of this height, mm.
+    pub fn shows_belt(&mut self, place: &Rectangle, height_mm: f64) -> bool {
+        let face = Face::cuboid(place, height_mm);
+        !face.is_low() && self.scroll.content(&face).shows_belt()
+    }
+
+    /// Whether the cells at a place are not those of a cuboid with that border and height, mm.
+    pub fn contradict(&mut self, place: &Rectangle, height_mm: f64) -> bool {
+        let face = Face::cuboid(place, height_mm);
+        let others = self.waiting.iter().chain(&self.gone);
+        !face.is_low() && self.scroll.content(&face).shows_belt()
+            || self.scroll.goes_on_beyond(&face, &others)
+    }
+
     /// Look at what most cells begin (of all, once the belt has `ended`). Returns whether there was anything. `fit`: the
     /// cuboid that the edges around a face show, if it lies over the belt.
     pub fn look(

@@ -66,6 +66,9 @@ pub struct Rectangle {
 }
 
 impl Rectangle {
+    /// Most of an area: more than this share.
+    pub const MOST: f64 = 0.5;
+
     /// Position along and across the rectangle, from its middle, mm.
     pub fn along_across(&self, x_mm: f64, y_mm: f64) -> (f64, f64) {
         let (sin, cos) = self.yaw.sin_cos();
@@ -135,6 +138,21 @@ impl Rectangle {
             other.outside_mm(x_mm, y_mm) < 0.0
         });
         inside.count() as f64 / (POINTS * POINTS) as f64
+    }
+
+    /// Whether most of one lies inside the other.
+    pub fn overlaps(&self, other: &Self) -> bool {
+        self.share_inside(other).max(other.share_inside(self)) > Self::MOST
+    }
+
+    /// Whether most of each lies inside the other.
+    pub fn is_same_place(&self, other: &Self) -> bool {
+        self.share_inside(other).min(other.share_inside(self)) > Self::MOST
+    }
+
+    /// Whether it is a small part of another: a label on a parcel, say.
+    pub fn is_detail_of(&self, other: &Self) -> bool {
+        self.share_inside(other) > Self::MOST && other.share_inside(self) <= Self::MOST
     }
 
     /// Share of its border that is edge.

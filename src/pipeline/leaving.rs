@@ -1,0 +1,364 @@
+//! One record a parcel, from two witnesses.
+//!
+//! Silhouettes (a track) show what differs from the empty belt; heights (a pass) show what rides over the belt. Each
+//! fails where the other does not: silhouettes in hard shadow, between near neighbours, on parcels as grey as the
+//! belt; heights on plain parcels a few mm high. What both saw at one place is one parcel: told is what is not in
+//! doubt, and where they differ by more than their sigmas, the sigma spans both. What one of them saw alone is told.
+//! A silhouette that is in doubt waits until all heights at its place are known: where these show the belt it was a
+//! shadow, and where they show parcels it was theirs, run together, or a piece of them.
+
+use super::{PIECE_MARGIN_PX, Pipeline};
+use crate::event::{Flags, ParcelRecord, Shape};
+use crate::stage::measure::{self, Outline, Params};
+use crate::stage::parcels::Rectangle;
+use crate::stage::passes::Passed;
+use crate::stage::track::Phase;
+use nalgebra::Vector2;
+
+/// Parcels that leave and are not told yet, of each witness; and places that were told last.
+const LEAVING_MAX: usize = 64;
+/// Records of one frame.
+const DECISIONS_MAX: usize = 16;
+/// Dimensions that differ by more than this many sigmas disagree.
+const DISAGREE_SIGMA: f64 = 3.0;
+/// What is not so many sigmas over the belt may be the belt.
+const RISES_SIGMA: f64 = 2.0;
+
+/// What the silhouettes showed of a parcel that has left.
+#[derive(Clone, Copy)]
+pub(super) struct Silhouette {
+    /// Its record, without a number.
+    pub record: ParcelRecord,
+    /// Its footprint, or that of its image on the belt.
+    pub place: Rectangle,
+    /// Measured without a doubt, and the heights at its place do not contradict.
+    pub is_certain: bool,
+}
+
+impl Silhouette {
+    /// Whether it is of several parcels.
+    fn is_run_together(&self) -> bool {
+        self.record.not_measured.is_some() || self.record.flags.has(Flags::MERGED)
+    }
+}
+
+/// A record, and what it was decided from.
+#[derive(Clone, Copy)]
+pub struct Decision {
+    /// As it was told.
+    pub record: ParcelRecord,
+    /// What the silhouettes alone showed.
+    pub silhouettes: Option<ParcelRecord>,
+    /// What the heights alone showed.
+    pub heights: Option<(ParcelRecord, Passed)>,
+}
+
+/// A parcel that was told: its footprint and height, mm.
+#[derive(Clone, Copy)]
+struct Told {
+    place: Rectangle,
+    height_mm: f64,
+    is_certain: bool,
+}
+
+/// What is leaving.
+#[derive(Default)]
+pub(super) struct Leaving {
+    silhouettes: heapless::Vec<Silhouette, LEAVING_MAX>,
+    passes: heapless::Vec<Passed, LEAVING_MAX>,
+    told: heapless::Vec<Told, LEAVING_MAX>,
+    pub decisions: heapless::Vec<Decision, DECISIONS_MAX>,
+    breaks: u32,
+    /// Parcels for which there was no room.
+    pub overflows: u64,
+}
+
+impl Leaving {
+    /// A track has left.
+    pub fn add_silhouette(&mut self, silhouette: Silhouette) {
+        self.overflows += u64::from(self.silhouettes.push(silhouette).is_err());
+    }
+
+    /// A pass is over.
+    pub fn add_pass(&mut self, passed: &Passed) {
+        self.overflows += u64::from(self.passes.push(*passed).is_err());
+    }
+
+    /// Nothing that was in view comes.
+    pub fn forget(&mut self) {
+        self.silhouettes.clear();
+        self.passes.clear();
+        self.told.clear();
+    }
+
+    fn is_told(&self, place: &Rectangle) -> bool {
+        self.told.iter().any(|told| told.place.overlaps(place))
+    }
+
+    fn tell(&mut self, place: Rectangle, record: &ParcelRecord) {
+        if self.told.is_full() {
+            self.told.remove(0);
+        }
+        // There is room.
+        let (height_mm, is_certain) = (record.height_mm, is_sure(record));
+        let _ = self.told.push(Told { place, height_mm, is_certain });
+    }
+
+    fn has_silhouette(&self, place: &Rectangle) -> bool {
+        self.silhouettes.iter().any(|s| s.place.overlaps(place))
+    }
+
+    /// The silhouette that a place is a small part of.
+    fn silhouette_around(&self, place: &Rectangle) -> Option<Silhouette> {
+        let mut around = self.silhouettes.iter().filter(|s| place.is_detail_of(&s.place));
+        around.next().copied()
+    }
+
+    /// Remove the silhouette at the place of a pass.
+    fn take_silhouette(&mut self, place: &Rectangle) -> Option<ParcelRecord> {
+        let found = self.silhouettes.iter().position(|s| s.place.is_same_place(place))?;
+        Some(self.silhouettes.remove(found).record)
+    }
+}
+
+impl Pipeline {
+    /// Tell what has left and is known. `all`: nothing more comes of it.
+    pub(super) fn decide(&mut self, all: bool, emit: &mut dyn FnMut(ParcelRecord)) {
+        let broken = self.is_broken();
+        let all = all || broken;
+        self.leaving.decisions.clear();
+        self.decide_passes(all, emit);
+        self.decide_silhouettes(all, emit);
+        if broken {
+            self.leaving.forget();
+            self.leaving.breaks = self.at.breaks;
+        }
+    }
+
+    /// Whether what is leaving was there before the belt's position broke.
+    fn is_broken(&self) -> bool {
+        self.leaving.breaks != self.at.breaks
+    }
+
+    fn decide_passes(&mut self, all: bool, emit: &mut dyn FnMut(ParcelRecord)) {
+        let mut i = 0;
+        while let Some(passed) = self.leaving.passes.get(i).copied() {
+            let place = passed.face.rectangle;
+            if !all {
+                if let Some(slot) = self.riding_at(|track| track.is_same_place(&place)) {
+                    self.leave(slot, Flags::default());
+                } else if self.riding_at(|track| place.is_detail_of(track)).is_some() {
+                    i += 1;
+                    continue;
+                }
+            }
+            self.leaving.passes.remove(i);
+            // What was still in the zone when the belt's position broke is seen again after it.
+            if passed.left || !self.is_broken() || self.leaving.has_silhouette(&place) {
+                self.decide_pass(&passed, &place, emit);
+            }
+        }
+    }
+
+    /// A track in the zone, by its cuboid.
+    fn riding_at(&self, is_meant: impl Fn(&Rectangle) -> bool) -> Option<usize> {
+        let tracks = self.tracker.tracks().iter().enumerate();
+        let mut riding = tracks.filter(|(_, t)| t.phase == Phase::Riding && !t.was_merged());
+        riding.find_map(|(slot, _)| {
+            let params = self.measure.params(slot, self.at)?;
+            is_meant(&place_of(&params, self.at.travel_mm)).then_some(slot)
+        })
+    }
+
+    fn decide_pass(
+        &mut self,
+        passed: &Passed,
+        place: &Rectangle,
+        emit: &mut dyn FnMut(ParcelRecord),
+    ) {
+        if self.leaving.is_told(place) {
+            return;
+        }
+        let heights = self.record_of_pass(passed);
+        let silhouettes = self.leaving.take_silhouette(place);
+        let around = self.leaving.silhouette_around(place);
+        let rises = heights.height_mm > RISES_SIGMA * heights.sigma_height_mm;
+        let record = match (&silhouettes, around) {
+            (Some(silhouettes), _) => self.agreed(silhouettes, &heights),
+            // A label, or glare, on what the silhouettes show.
+            (None, Some(around)) if around.is_certain || !is_sure(&heights) => return,
+            (None, Some(around)) if !around.is_run_together() => {
+                self.spread(heights, &around.record)
+            }
+            (None, None) if !rises => return,
+            // What has neither a face nor a silhouette is noise.
+            (None, None)
+                if heights.shape != Shape::Box && !self.differs_from_belt(&heights, place) =>
+            {
+                return;
+            }
+            (None, _) => heights,
+        };
+        self.leaving.tell(*place, &record);
+        let heights = Some((heights, *passed));
+        self.emit_decision(Decision { record, silhouettes, heights }, emit);
+    }
+
+    /// Whether silhouettes showed anything of a parcel, whatever became of it.
+    fn differs_from_belt(&self, record: &ParcelRecord, place: &Rectangle) -> bool {
+        let params = params_of(place, record.height_mm);
+        let outline = Outline::new(&self.site.view, &params, self.at.travel_mm);
+        let margin_mm = PIECE_MARGIN_PX * self.site.view.mm_per_px;
+        let tracks = self.tracker.tracks().iter().enumerate();
+        let mut tracked = tracks.filter(|(_, track)| track.phase != Phase::Free);
+        self.leaving.has_silhouette(place)
+            || tracked.any(|(slot, _)| {
+                let middle = self.image_on_belt(slot);
+                outline.covers(Vector2::new(middle.x, middle.y), margin_mm)
+                    || self.place_of_image(slot).overlaps(place)
+            })
+    }
+
+    fn decide_silhouettes(&mut self, all: bool, emit: &mut dyn FnMut(ParcelRecord)) {
+        let mut i = 0;
+        while let Some(silhouette) = self.leaving.silhouettes.get(i).copied() {
+            if !all && self.heights_may_come(&silhouette) {
+                i += 1;
+            } else {
+                self.leaving.silhouettes.remove(i);
+                self.decide_silhouette(&silhouette, emit);
+            }
+        }
+    }
+
+    /// Whether heights may still tell what a silhouette was.
+    fn heights_may_come(&self, silhouette: &Silhouette) -> bool {
+        let place = &silhouette.place;
+        self.leaving.passes.iter().any(|passed| passed.face.rectangle.overlaps(place))
+            || self.passes.expects(place)
+            || !silhouette.is_certain && !self.passes.has_settled(place)
+    }
+
+    fn decide_silhouette(&mut self, silhouette: &Silhouette, emit: &mut dyn FnMut(ParcelRecord)) {
+        let Silhouette { mut record, place, is_certain } = *silhouette;
+        if self.is_explained(silhouette) {
+            return;
+        }
+        let is_measured = record.not_measured.is_none();
+        if is_measured && !is_certain && self.passes.shows_belt(&place, record.height_mm) {
+            self.counters.slivers += 1;
+            return;
+        }
+        let rises = record.height_mm > RISES_SIGMA * record.sigma_height_mm;
+        let is_doubted = is_sure(&record) && !(is_certain && rises);
+        record.flags.set(Flags::HEIGHT_DISPUTED, is_doubted);
+        self.leaving.tell(place, &record);
+        let silhouettes = Some(silhouette.record);
+        self.emit_decision(Decision { record, silhouettes, heights: None }, emit);
+    }
+
+    /// Whether what was told explains a silhouette: it lies there, or is an image of that, or is in doubt and holds it.
+    fn is_explained(&self, silhouette: &Silhouette) -> bool {
+        let place = &silhouette.place;
+        let told = self.leaving.told.iter();
+        let share: f64 = told.clone().map(|told| place.share_inside(&told.place)).sum();
+        let is_whole = !silhouette.is_run_together();
+        let holds = |told: &Told| {
+            !silhouette.is_certain && told.place.overlaps(place) && (told.is_certain || !is_whole)
+        };
+        let middle = Vector2::new(silhouette.record.x_mm, silhouette.record.y_mm);
+        let margin_mm = PIECE_MARGIN_PX * self.site.view.mm_per_px;
+        let is_image_of = |told: &Told| {
+            let params = params_of(&told.place, told.height_mm);
+            let outline = Outline::new(&self.site.view, &params, silhouette.record.belt_travel_mm);
+            silhouette.record.not_measured.is_some() && outline.covers(middle, margin_mm)
+        };
+        share > Rectangle::MOST || told.clone().any(|told| holds(told) || is_image_of(told))
+    }
+
+    fn emit_decision(&mut self, mut decision: Decision, emit: &mut dyn FnMut(ParcelRecord)) {
+        if !self.reporting {
+            return;
+        }
+        let is_fit = self.condition().is_fit();
+        let record = &mut decision.record;
+        self.counters.parcels += 1;
+        self.counters.unmeasured += u64::from(record.not_measured.is_some());
+        self.counters.lost += u64::from(record.flags.has(Flags::LOST));
+        record.seq = self.counters.parcels as u32;
+        record.may_be_used = record.not_measured.is_none() && record.flags.is_empty() && is_fit;
+        *record = record.rounded();
+        emit(*record);
+        // Only who asks for reasons misses one.
+        let _ = self.leaving.decisions.push(decision);
+    }
+
+    /// The record of a parcel that both saw.
+    fn agreed(&self, silhouettes: &ParcelRecord, heights: &ParcelRecord) -> ParcelRecord {
+        let by_silhouettes = is_sure(silhouettes) && !is_sure(heights);
+        let (record, other) =
+            if by_silhouettes { (*silhouettes, heights) } else { (*heights, silhouettes) };
+        let mut record = self.spread(record, other);
+        for fact in [Flags::UNFINISHED, Flags::LOST, Flags::CLIPPED] {
+            record.flags.set(fact, other.flags.has(fact));
+        }
+        record
+    }
+
+    /// Where another cuboid was seen than in a record, by more than the sigmas, its sigmas span both.
+    fn spread(&self, mut record: ParcelRecord, other: &ParcelRecord) -> ParcelRecord {
+        if other.shape != Shape::Box
+            || [Flags::MERGED, Flags::CLIPPED].iter().any(|&f| other.flags.has(f))
+        {
+            return record;
+        }
+        let off_mm = [
+            record.length_mm - other.length_mm,
+            record.width_mm - other.width_mm,
+            record.height_mm - other.height_mm,
+        ];
+        let sigmas_mm =
+            [&mut record.sigma_length_mm, &mut record.sigma_width_mm, &mut record.sigma_height_mm];
+        let others_mm = [other.sigma_length_mm, other.sigma_width_mm, other.sigma_height_mm];
+        for ((off_mm, sigma_mm), other_mm) in off_mm.into_iter().zip(sigmas_mm).zip(others_mm) {
+            if off_mm.abs() > DISAGREE_SIGMA * sigma_mm.hypot(other_mm) {
+                *sigma_mm = sigma_mm.hypot(0.5 * off_mm);
+            }
+        }
+        let sigma_max_mm = self.site.config.measure.sigma_max_mm;
+        let footprint_sigma_mm = record.sigma_length_mm.max(record.sigma_width_mm);
+        record.flags.set(Flags::HEIGHT_UNCERTAIN, record.sigma_height_mm > sigma_max_mm);
+        record.flags.set(Flags::FOOTPRINT_UNCERTAIN, footprint_sigma_mm > sigma_max_mm);
+        record
+    }
+}
+
+/// Whether a record is without a doubt.
+fn is_sure(record: &ParcelRecord) -> bool {
+    record.not_measured.is_none() && record.flags.is_empty()
+}
+
+/// The footprint of a cuboid that is there when the belt has travelled so far.
+pub(super) fn place_of(params: &Params, travel_mm: f64) -> Rectangle {
+    Rectangle {
+        x_mm: params[measure::X] - travel_mm,
+        y_mm: params[measure::Y],
+        yaw: params[measure::YAW],
+        length_mm: params[measure::LENGTH],
+        width_mm: params[measure::WIDTH],
+        ..Rectangle::default()
+    }
+}
+
+/// A cuboid over a footprint, before any travel.
+fn params_of(place: &Rectangle, height_mm: f64) -> Params {
+    let mut params = Params::zeros();
+    params[measure::X] = place.x_mm;
+    params[measure::Y] = place.y_mm;
+    params[measure::YAW] = place.yaw;
+    params[measure::LENGTH] = place.length_mm;
+    params[measure::WIDTH] = place.width_mm;
+    params[measure::HEIGHT] = height_mm;
+    params[measure::SCALE] = 1.0;
+    params
+}
