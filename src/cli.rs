@@ -97,8 +97,7 @@ pub enum Command {
         /// Write annotated pictures to this folder.
         #[arg(long, value_name = "DIR", help_heading = RESULTS)]
         annotate: Option<PathBuf>,
-        /// Write a second opinion to this folder: heights by known motion over the whole pass, as
-        /// records and as a picture.
+        /// Write to this folder why each parcel was told as it was, and a picture of the belt's heights.
         #[arg(long, value_name = "DIR", help_heading = RESULTS)]
         explain: Option<PathBuf>,
     },

@@ -503,11 +503,11 @@ fn with_frames_dropped(belts: std::ops::Range<u64>) {
 
 #[test]
 fn with_frames_dropped_at_random_every_parcel_is_told_once() {
-    with_frames_dropped(0..20);
+    with_frames_dropped(0..8);
 }
 
 #[test]
 #[ignore = "minutes"]
 fn with_frames_dropped_on_many_belts_every_parcel_is_told_once() {
-    with_frames_dropped(20..220);
+    with_frames_dropped(8..208);
 }

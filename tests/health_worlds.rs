@@ -17,6 +17,8 @@ use beltgauge::source::synthetic::Synthetic;
 use beltgauge::source::{FaultInjector, FrameSource};
 use class::Class;
 use generator::{World, draw};
+use std::sync::Mutex;
+use std::sync::atomic::{AtomicUsize, Ordering};
 
 /// The same frames come again and again, until so many have come: what stands has been learned and looked at.
 const FRAMES: u64 = 1200;
@@ -54,30 +56,44 @@ fn told(mut world: World) -> (Condition, [Level; 3]) {
     (pipeline.condition(), worst)
 }
 
+/// What is told of a world that must not be, and a line about it.
+fn judge(class: Class, name: &str, seed: u64) -> Option<String> {
+    let world = draw(seed, |_| class);
+    let frames = world.scenario.frames;
+    let (last, worst) = told(world);
+    let (place, light) = (last.place, last.light);
+    eprintln!(
+        "{name}:{seed}: {frames} frames, {:?} {:.3} px {:.3} mm, blur {:?}, light {:+.2} in {}: {worst:?}",
+        place.watching,
+        place.moved.picture_px,
+        place.moved.error_mm,
+        last.sharpness.blur_px,
+        light.change,
+        light.region
+    );
+    // A noisy camera's picture is blurred from the start there, and so is a squeezed one.
+    (worst[0].max(worst[2]) > Level::Good).then(|| format!("{name}:{seed}: {worst:?}"))
+}
+
 #[test]
 fn nothing_is_told_where_nothing_is() {
     let count = std::env::var("WORLDS").map_or(1, |n| n.parse().expect("a number"));
     let of_each = |(class, name): (Class, &'static str)| (0..count).map(move |k| (class, name, k));
-    let mut told_of = Vec::new();
-    for (class, name, seed) in Class::ALL.into_iter().flat_map(of_each) {
-        let world = draw(seed, |_| class);
-        let frames = world.scenario.frames;
-        let (last, worst) = told(world);
-        let (place, light) = (last.place, last.light);
-        eprintln!(
-            "{name}:{seed}: {frames} frames, {:?} {:.3} px {:.3} mm, blur {:?}, light {:+.2} in {}: {worst:?}",
-            place.watching,
-            place.moved.picture_px,
-            place.moved.error_mm,
-            last.sharpness.blur_px,
-            light.change,
-            light.region
-        );
-        // A noisy camera's picture is blurred from the start there, and so is a squeezed one.
-        let level = worst[0].max(worst[2]);
-        if level > Level::Good {
-            told_of.push(format!("{name}:{seed}: {worst:?}"));
+    let worlds: Vec<_> = Class::ALL.into_iter().flat_map(of_each).collect();
+    let next = AtomicUsize::new(0);
+    let told_of = Mutex::new(Vec::new());
+    std::thread::scope(|scope| {
+        for _ in 0..std::thread::available_parallelism().map_or(1, usize::from) {
+            scope.spawn(|| {
+                while let Some(&(class, name, seed)) =
+                    worlds.get(next.fetch_add(1, Ordering::Relaxed))
+                {
+                    let told = judge(class, name, seed);
+                    told_of.lock().expect("no panic").extend(told);
+                }
+            });
         }
-    }
+    });
+    let told_of = told_of.into_inner().expect("no panic");
     assert!(told_of.is_empty(), "{told_of:#?}");
 }

@@ -14,7 +14,7 @@ use std::fmt::Write as _;
 use std::sync::Mutex;
 use std::sync::atomic::{AtomicU64, Ordering};
 
-const BELTS: u64 = 20;
+const BELTS: u64 = 12;
 const PARCELS_PER_BELT: usize = 10;
 const FPS: f64 = 40.0;
 const SIZE_PX: [f64; 2] = [1280.0, 800.0];

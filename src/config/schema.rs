@@ -269,7 +269,7 @@ pub struct Limits {
 impl Default for Limits {
     fn default() -> Self {
         Self {
-            memory_mib_max: 768,
+            memory_mib_max: 1024,
             tracks_max: 16,
             runs_max: 16384,
             blobs_max: 512,

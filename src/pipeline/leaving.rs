@@ -21,6 +21,8 @@ const LEAVING_MAX: usize = 64;
 const DECISIONS_MAX: usize = 16;
 /// Dimensions that differ by more than this many sigmas disagree.
 const DISAGREE_SIGMA: f64 = 3.0;
+/// Cuboids that together fill this share of one are what it was taken for: a gap is narrower than a label's rest.
+const PARTS_SHARE_MIN: f64 = 0.8;
 /// What is not so many sigmas over the belt may be the belt.
 const RISES_SIGMA: f64 = 2.0;
 
@@ -33,6 +35,8 @@ pub(super) struct Silhouette {
     pub place: Rectangle,
     /// Measured without a doubt, and the heights at its place do not contradict.
     pub is_certain: bool,
+    /// Share of its edges that were found.
+    pub edge_share: f64,
 }
 
 impl Silhouette {
@@ -115,9 +119,21 @@ impl Leaving {
     }
 
     /// Remove the silhouette at the place of a pass.
-    fn take_silhouette(&mut self, place: &Rectangle) -> Option<ParcelRecord> {
+    fn take_silhouette(&mut self, place: &Rectangle) -> Option<Silhouette> {
         let found = self.silhouettes.iter().position(|s| s.place.is_same_place(place))?;
-        Some(self.silhouettes.remove(found).record)
+        Some(self.silhouettes.remove(found))
+    }
+
+    /// Whether a place is that of several cuboids with hardly a gap, as the silhouettes show them.
+    fn is_parted(&mut self, place: &Rectangle) -> bool {
+        let is_part = |s: &Silhouette| s.record.shape == Shape::Box && s.place.is_detail_of(place);
+        let parts = self.silhouettes.iter().filter(|s| is_part(s));
+        let share: f64 = parts.clone().map(|s| place.share_inside(&s.place)).sum();
+        let is_parted = parts.count() > 1 && share > PARTS_SHARE_MIN;
+        for part in self.silhouettes.iter_mut().filter(|s| is_parted && is_part(s)) {
+            part.record.flags.set(Flags::MERGED, true);
+        }
+        is_parted
     }
 }
 
@@ -147,7 +163,10 @@ impl Pipeline {
             if !all {
                 if let Some(slot) = self.riding_at(|track| track.is_same_place(&place)) {
                     self.leave(slot, Flags::default());
-                } else if self.riding_at(|track| place.is_detail_of(track)).is_some() {
+                } else if self
+                    .riding_at(|track| place.is_detail_of(track) || track.is_detail_of(&place))
+                    .is_some()
+                {
                     i += 1;
                     continue;
                 }
@@ -176,7 +195,7 @@ impl Pipeline {
         place: &Rectangle,
         emit: &mut dyn FnMut(ParcelRecord),
     ) {
-        if self.leaving.is_told(place) {
+        if self.leaving.is_told(place) || self.leaving.is_parted(place) {
             return;
         }
         let heights = self.record_of_pass(passed);
@@ -184,7 +203,9 @@ impl Pipeline {
         let around = self.leaving.silhouette_around(place);
         let rises = heights.height_mm > RISES_SIGMA * heights.sigma_height_mm;
         let record = match (&silhouettes, around) {
-            (Some(silhouettes), _) => self.agreed(silhouettes, &heights),
+            (Some(silhouettes), _) => {
+                self.agreed(silhouettes, &heights, passed.measured.estimate.edge_share)
+            }
             // A label, or glare, on what the silhouettes show.
             (None, Some(around)) if around.is_certain || !is_sure(&heights) => return,
             (None, Some(around)) if !around.is_run_together() => {
@@ -200,17 +221,19 @@ impl Pipeline {
             (None, _) => heights,
         };
         self.leaving.tell(*place, &record);
+        let silhouettes = silhouettes.map(|silhouettes| silhouettes.record);
         let heights = Some((heights, *passed));
         self.emit_decision(Decision { record, silhouettes, heights }, emit);
     }
 
-    /// Whether silhouettes showed anything of a parcel, whatever became of it.
+    /// Whether silhouettes that are not told yet showed anything of a parcel.
     fn differs_from_belt(&self, record: &ParcelRecord, place: &Rectangle) -> bool {
         let params = params_of(place, record.height_mm);
         let outline = Outline::new(&self.site.view, &params, self.at.travel_mm);
         let margin_mm = PIECE_MARGIN_PX * self.site.view.mm_per_px;
         let tracks = self.tracker.tracks().iter().enumerate();
-        let mut tracked = tracks.filter(|(_, track)| track.phase != Phase::Free);
+        let mut tracked =
+            tracks.filter(|(_, t)| matches!(t.phase, Phase::Candidate | Phase::Riding));
         self.leaving.has_silhouette(place)
             || tracked.any(|(slot, _)| {
                 let middle = self.image_on_belt(slot);
@@ -240,12 +263,12 @@ impl Pipeline {
     }
 
     fn decide_silhouette(&mut self, silhouette: &Silhouette, emit: &mut dyn FnMut(ParcelRecord)) {
-        let Silhouette { mut record, place, is_certain } = *silhouette;
+        let Silhouette { mut record, place, is_certain, .. } = *silhouette;
         if self.is_explained(silhouette) {
             return;
         }
         let is_measured = record.not_measured.is_none();
-        if is_measured && !is_certain && self.passes.shows_belt(&place, record.height_mm) {
+        if is_measured && !is_sure(&record) && self.passes.shows_belt(&place, record.height_mm) {
             self.counters.slivers += 1;
             return;
         }
@@ -293,9 +316,18 @@ impl Pipeline {
         let _ = self.leaving.decisions.push(decision);
     }
 
-    /// The record of a parcel that both saw.
-    fn agreed(&self, silhouettes: &ParcelRecord, heights: &ParcelRecord) -> ParcelRecord {
-        let by_silhouettes = is_sure(silhouettes) && !is_sure(heights);
+    /// The record of a parcel that both saw: of what is not in doubt, else of the one that more edges confirm; of two
+    /// that are no cuboids the smaller one. `edge_share`: of the edges that the heights led to.
+    fn agreed(&self, seen: &Silhouette, heights: &ParcelRecord, edge_share: f64) -> ParcelRecord {
+        let silhouettes = &seen.record;
+        let volume = |r: &ParcelRecord| r.length_mm * r.width_mm * r.height_mm;
+        let neither_is_box = [silhouettes, heights].iter().all(|r| r.shape != Shape::Box);
+        let by_silhouettes = silhouettes.not_measured.is_none()
+            && match (is_sure(silhouettes), is_sure(heights)) {
+                (false, false) if neither_is_box => volume(silhouettes) < volume(heights),
+                (true, true) => seen.edge_share > edge_share,
+                (sure, other) => sure && !other,
+            };
         let (record, other) =
             if by_silhouettes { (*silhouettes, heights) } else { (*heights, silhouettes) };
         let mut record = self.spread(record, other);

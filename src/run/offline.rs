@@ -21,7 +21,7 @@ pub struct Outputs<'a> {
     pub jsonl: Option<&'a Path>,
     /// Annotated pictures.
     pub annotate: Option<&'a Path>,
-    /// A second opinion: its records and the picture of its evidence.
+    /// Why each parcel was told as it was, and a picture of the belt's heights.
     pub explain: Option<&'a Path>,
 }
 

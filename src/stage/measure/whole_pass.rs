@@ -158,6 +158,12 @@ impl WholePass {
         let mut params = Self::params_of(border, height_mm, newest.travel_mm);
         let m = self.geometry.magnification(height_mm);
         let sigma = m * m / self.geometry.camera_height_mm * FACE_HEIGHT_SIGMA_MM;
+        // The face's height was found with the same travel: it is as wrong as that.
+        let top_motion = |travel_sigma: f64| TopMotion {
+            ratio: m,
+            sigma: sigma.hypot(m * travel_sigma),
+            highest: m,
+        };
         let geometry = self.geometry.clone();
         let zone = self.zone;
         let mut problem = Problem {
@@ -169,7 +175,7 @@ impl WholePass {
             travel_sigma: 1.0,
             silhouette: Silhouette::Whole,
             enclosing: false,
-            top_motion: Some(TopMotion { ratio: m, sigma, highest: m }),
+            top_motion: None,
             view_stride: 1,
         };
         let mut best: Option<(Estimate, Kept)> = None;
@@ -177,6 +183,7 @@ impl WholePass {
             let (count, first) = self.look(views, &params, newest.travel_mm);
             let (pass, first) = (&self.pass[..count], first?);
             problem.travel_sigma = newest.sigma_since(&first.at);
+            problem.top_motion = Some(top_motion(problem.travel_sigma));
             let fitted = if round == 0 {
                 problem.refine_edges(pass, params, &GATES_PX)
             } else {

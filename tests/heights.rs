@@ -1,4 +1,4 @@
-//! Heights by known motion, cell by cell, on a belt of the project's own: what `measure --explain` rests on.
+//! Heights by known motion, cell by cell, and what is found in them, on a belt of the project's own.
 
 mod common;
 
@@ -54,7 +54,7 @@ const SHARE_MIN: f64 = 0.5;
 /// 1.5 m above, by 28 mm. A border behind it is known to that.
 const BORDER_MM: f64 = 28.0;
 
-/// What the second opinion saw of a belt.
+/// What was seen of a belt.
 struct Seen {
     scenario: Scenario,
     passes: Passes,
