@@ -74,6 +74,11 @@ impl Flags {
         }
     }
 
+    /// Take `flag` out.
+    pub fn clear(&mut self, flag: Self) {
+        self.0 &= !flag.0;
+    }
+
     /// Whether `flag` is in the set.
     pub fn has(self, flag: Self) -> bool {
         self.0 & flag.0 == flag.0

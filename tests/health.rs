@@ -16,7 +16,7 @@ use common::truth::{Json, load, write_site};
 use std::process::Command;
 
 /// Every so many frames of a recording are shown: a slower camera sees the same of the still scene.
-const FRAMES_APART: usize = 3;
+const FRAMES_APART: usize = 2;
 
 /// A recording that is played again and again, back and forth.
 struct Recording {

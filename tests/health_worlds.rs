@@ -21,7 +21,7 @@ use std::sync::Mutex;
 use std::sync::atomic::{AtomicUsize, Ordering};
 
 /// The same frames come again and again, until so many have come: what stands has been learned and looked at.
-const FRAMES: u64 = 1200;
+const FRAMES: u64 = 600;
 
 /// What is known at the end, and the worst that was told on the way.
 fn told(mut world: World) -> (Condition, [Level; 3]) {

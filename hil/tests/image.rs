@@ -392,7 +392,7 @@ fn a_stick_that_is_in_at_power_on_needs_its_signature_too() {
 #[test]
 fn power_cuts_during_imports_lose_neither_configuration_nor_identity() {
     // Each takes half a minute: POWER_CUTS=50 is what the results are from.
-    let cuts = std::env::var("POWER_CUTS").map_or(16, |cuts| cuts.parse().expect("a number"));
+    let cuts = std::env::var("POWER_CUTS").map_or(6, |cuts| cuts.parse().expect("a number"));
     let bench = bench();
     // Two machines at a time, one for each processor of a small build machine.
     std::thread::scope(|scope| {

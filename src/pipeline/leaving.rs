@@ -209,6 +209,7 @@ impl Pipeline {
             // A label, or glare, on what the silhouettes show.
             (None, Some(around)) if around.is_certain || !is_sure(&heights) => return,
             (None, Some(around)) if !around.is_run_together() => {
+                self.leaving.silhouettes.retain(|s| !place.is_detail_of(&s.place));
                 self.spread(heights, &around.record)
             }
             (None, None) if !rises => return,
@@ -330,18 +331,20 @@ impl Pipeline {
             };
         let (record, other) =
             if by_silhouettes { (*silhouettes, heights) } else { (*heights, silhouettes) };
-        let mut record = self.spread(record, other);
-        for fact in [Flags::UNFINISHED, Flags::LOST, Flags::CLIPPED] {
-            record.flags.set(fact, other.flags.has(fact));
-        }
+        let mut record =
+            if other.shape == Shape::Box { self.spread(record, other) } else { record };
+        let both = |flag| silhouettes.flags.has(flag) && heights.flags.has(flag);
+        let either = |flag| silhouettes.flags.has(flag) || heights.flags.has(flag);
+        record.flags.clear(Flags::UNFINISHED);
+        record.flags.set(Flags::UNFINISHED, both(Flags::UNFINISHED));
+        record.flags.set(Flags::LOST, silhouettes.flags.has(Flags::LOST));
+        record.flags.set(Flags::CLIPPED, either(Flags::CLIPPED));
         record
     }
 
     /// Where another cuboid was seen than in a record, by more than the sigmas, its sigmas span both.
     fn spread(&self, mut record: ParcelRecord, other: &ParcelRecord) -> ParcelRecord {
-        if other.shape != Shape::Box
-            || [Flags::MERGED, Flags::CLIPPED].iter().any(|&f| other.flags.has(f))
-        {
+        if [Flags::MERGED, Flags::CLIPPED].iter().any(|&flag| other.flags.has(flag)) {
             return record;
         }
         let off_mm = [
