@@ -7,6 +7,18 @@ use serde_json::{Value, json};
 /// A thing on the page that is there and shows something.
 const TEXT: &str = "return document.querySelector('main').innerText.length > 50";
 
+/// Everything for somebody elsewhere.
+async fn the_bundle_is_gzip(browser: &Browser) {
+    browser.run("location.hash = '#events'").await;
+    let bundle = "document.querySelector('a[download=\"beltgauge-bundle.tar.gz\"]')";
+    browser.wait("the link", &format!("return {bundle} !== null")).await;
+    let begins = format!(
+        "return fetch({bundle}.href).then((answer) => answer.arrayBuffer())
+            .then((file) => new DataView(file).getUint16(0))"
+    );
+    assert_eq!(browser.run(&begins).await, 0x1f8b, "it is gzip");
+}
+
 #[tokio::test(flavor = "multi_thread")]
 async fn the_page_shows_pictures_and_parcels_in_both_languages_and_its_console_is_silent() {
     let demo = Demo::start("web", 600, false);
@@ -90,15 +102,7 @@ async fn the_page_shows_pictures_and_parcels_in_both_languages_and_its_console_i
     let lines: Vec<&str> = table.as_str().expect("text").lines().collect();
     assert!(lines[0].starts_with("n,utc,seq,length_mm,") && lines.len() > 2, "{lines:?}");
 
-    // Everything for somebody elsewhere.
-    browser.run("location.hash = '#events'").await;
-    let bundle = "document.querySelector('a[download=\"beltgauge-bundle.tar.gz\"]')";
-    browser.wait("the link", &format!("return {bundle} !== null")).await;
-    let begins = format!(
-        "return fetch({bundle}.href).then((answer) => answer.arrayBuffer())
-            .then((file) => new DataView(file).getUint16(0))"
-    );
-    assert_eq!(browser.run(&begins).await, 0x1f8b, "it is gzip");
+    the_bundle_is_gzip(&browser).await;
     browser.run("location.hash = '#parcels'").await;
     browser.wait("the link", "return document.querySelector('a[download]') !== null").await;
 
