@@ -15,9 +15,6 @@ use beltgauge::units::RawPx;
 use common::truth::{Json, load, write_site};
 use std::process::Command;
 
-/// Every so many frames of a recording are shown: a slower camera sees the same of the still scene.
-const FRAMES_APART: usize = 2;
-
 /// A recording that is played again and again, back and forth.
 struct Recording {
     site: Site,
@@ -60,10 +57,8 @@ impl Recording {
         memory.seal().expect("all taken");
         let [width, height] = self.site.camera.image_size_px;
         let mut told = vec![watch.condition()];
-        let fps = self.fps / FRAMES_APART as f64;
-        for k in 0..((before_s + then_s) * fps) as usize {
-            let frames = if (k as f64) < before_s * fps { &self.frames } else { then };
-            let k = k * FRAMES_APART;
+        for k in 0..((before_s + then_s) * self.fps) as usize {
+            let frames = if (k as f64) < before_s * self.fps { &self.frames } else { then };
             let there = frames.len();
             let at = k % (2 * there);
             let frame = &frames[if at < there { at } else { 2 * there - 1 - at }];
@@ -72,7 +67,7 @@ impl Recording {
             watch.step(
                 &self.site,
                 raw,
-                Ride { covered: &[], travel_mm, moving_s: Some(1.0 / fps) },
+                Ride { covered: &[], travel_mm, moving_s: Some(1.0 / self.fps) },
             );
             let now = watch.condition();
             if told.last() != Some(&now) {
