@@ -4,6 +4,7 @@
 //! Owns: every stage, in one mapping planned from the configuration. Reads no clock, draws no
 //! random number, allocates nothing: a recording replays to the same records on every run.
 
+mod agreement;
 mod gap;
 mod leaving;
 mod motion;
@@ -264,7 +265,8 @@ impl Pipeline {
         decided.motion
     }
 
-    /// The belt is empty: forget what it looked like, and the parcels in view, and learn it anew.
+    /// The belt is empty: forget what it looked like, and the tracks in view, and learn it anew. Heights need no empty
+    /// belt: what they have seen is told.
     pub fn learn(&mut self) {
         self.background.forget();
         self.tracker.forget();

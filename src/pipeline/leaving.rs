@@ -7,6 +7,7 @@
 //! A silhouette that is in doubt waits until all heights at its place are known: where these show the belt it was a
 //! shadow, and where they show parcels it was theirs, run together, or a piece of them.
 
+use super::agreement::{agreed, is_sure, spread};
 use super::{PIECE_MARGIN_PX, Pipeline};
 use crate::event::{Flags, ParcelRecord, Shape};
 use crate::stage::measure::{self, Outline, Params};
@@ -19,8 +20,6 @@ use nalgebra::Vector2;
 const LEAVING_MAX: usize = 64;
 /// Records of one frame.
 const DECISIONS_MAX: usize = 16;
-/// Dimensions that differ by more than this many sigmas disagree.
-const DISAGREE_SIGMA: f64 = 3.0;
 /// Cuboids that together fill this share of one are what it was taken for: a gap is narrower than a label's rest.
 const PARTS_SHARE_MIN: f64 = 0.8;
 /// What is not so many sigmas over the belt may be the belt.
@@ -199,18 +198,23 @@ impl Pipeline {
             return;
         }
         let heights = self.record_of_pass(passed);
+        if !self.counts([heights.length_mm, heights.width_mm]) {
+            self.counters.slivers += 1;
+            return;
+        }
         let silhouettes = self.leaving.take_silhouette(place);
         let around = self.leaving.silhouette_around(place);
         let rises = heights.height_mm > RISES_SIGMA * heights.sigma_height_mm;
         let record = match (&silhouettes, around) {
             (Some(silhouettes), _) => {
-                self.agreed(silhouettes, &heights, passed.measured.estimate.edge_share)
+                let edge_shares = [silhouettes.edge_share, passed.measured.estimate.edge_share];
+                agreed(&silhouettes.record, &heights, edge_shares, self.sigma_max_mm())
             }
             // A label, or glare, on what the silhouettes show.
             (None, Some(around)) if around.is_certain || !is_sure(&heights) => return,
             (None, Some(around)) if !around.is_run_together() => {
                 self.leaving.silhouettes.retain(|s| !place.is_detail_of(&s.place));
-                self.spread(heights, &around.record)
+                spread(heights, &around.record, self.sigma_max_mm())
             }
             (None, None) if !rises => return,
             // What has neither a face nor a silhouette is noise.
@@ -225,6 +229,10 @@ impl Pipeline {
         let silhouettes = silhouettes.map(|silhouettes| silhouettes.record);
         let heights = Some((heights, *passed));
         self.emit_decision(Decision { record, silhouettes, heights }, emit);
+    }
+
+    fn sigma_max_mm(&self) -> f64 {
+        self.site.config.measure.sigma_max_mm
     }
 
     /// Whether silhouettes that are not told yet showed anything of a parcel.
@@ -316,61 +324,6 @@ impl Pipeline {
         // Only who asks for reasons misses one.
         let _ = self.leaving.decisions.push(decision);
     }
-
-    /// The record of a parcel that both saw: of what is not in doubt, else of the one that more edges confirm; of two
-    /// that are no cuboids the smaller one. `edge_share`: of the edges that the heights led to.
-    fn agreed(&self, seen: &Silhouette, heights: &ParcelRecord, edge_share: f64) -> ParcelRecord {
-        let silhouettes = &seen.record;
-        let volume = |r: &ParcelRecord| r.length_mm * r.width_mm * r.height_mm;
-        let neither_is_box = [silhouettes, heights].iter().all(|r| r.shape != Shape::Box);
-        let by_silhouettes = silhouettes.not_measured.is_none()
-            && match (is_sure(silhouettes), is_sure(heights)) {
-                (false, false) if neither_is_box => volume(silhouettes) < volume(heights),
-                (true, true) => seen.edge_share > edge_share,
-                (sure, other) => sure && !other,
-            };
-        let (record, other) =
-            if by_silhouettes { (*silhouettes, heights) } else { (*heights, silhouettes) };
-        let mut record =
-            if other.shape == Shape::Box { self.spread(record, other) } else { record };
-        let both = |flag| silhouettes.flags.has(flag) && heights.flags.has(flag);
-        let either = |flag| silhouettes.flags.has(flag) || heights.flags.has(flag);
-        record.flags.clear(Flags::UNFINISHED);
-        record.flags.set(Flags::UNFINISHED, both(Flags::UNFINISHED));
-        record.flags.set(Flags::LOST, silhouettes.flags.has(Flags::LOST));
-        record.flags.set(Flags::CLIPPED, either(Flags::CLIPPED));
-        record
-    }
-
-    /// Where another cuboid was seen than in a record, by more than the sigmas, its sigmas span both.
-    fn spread(&self, mut record: ParcelRecord, other: &ParcelRecord) -> ParcelRecord {
-        if [Flags::MERGED, Flags::CLIPPED].iter().any(|&flag| other.flags.has(flag)) {
-            return record;
-        }
-        let off_mm = [
-            record.length_mm - other.length_mm,
-            record.width_mm - other.width_mm,
-            record.height_mm - other.height_mm,
-        ];
-        let sigmas_mm =
-            [&mut record.sigma_length_mm, &mut record.sigma_width_mm, &mut record.sigma_height_mm];
-        let others_mm = [other.sigma_length_mm, other.sigma_width_mm, other.sigma_height_mm];
-        for ((off_mm, sigma_mm), other_mm) in off_mm.into_iter().zip(sigmas_mm).zip(others_mm) {
-            if off_mm.abs() > DISAGREE_SIGMA * sigma_mm.hypot(other_mm) {
-                *sigma_mm = sigma_mm.hypot(0.5 * off_mm);
-            }
-        }
-        let sigma_max_mm = self.site.config.measure.sigma_max_mm;
-        let footprint_sigma_mm = record.sigma_length_mm.max(record.sigma_width_mm);
-        record.flags.set(Flags::HEIGHT_UNCERTAIN, record.sigma_height_mm > sigma_max_mm);
-        record.flags.set(Flags::FOOTPRINT_UNCERTAIN, footprint_sigma_mm > sigma_max_mm);
-        record
-    }
-}
-
-/// Whether a record is without a doubt.
-fn is_sure(record: &ParcelRecord) -> bool {
-    record.not_measured.is_none() && record.flags.is_empty()
 }
 
 /// The footprint of a cuboid that is there when the belt has travelled so far.
@@ -396,4 +349,68 @@ fn params_of(place: &Rectangle, height_mm: f64) -> Params {
     params[measure::HEIGHT] = height_mm;
     params[measure::SCALE] = 1.0;
     params
+}
+
+#[cfg(test)]
+mod tests {
+    use super::super::agreement::tests::record;
+    use super::*;
+
+    /// Of a length along X, its middle at `x_mm`.
+    fn silhouette(x_mm: f64, length_mm: f64, is_certain: bool) -> Silhouette {
+        let place = Rectangle { x_mm, length_mm, width_mm: 150.0, ..Rectangle::default() };
+        let record = record([length_mm, 150.0, 60.0], 0.5);
+        Silhouette { record, place, is_certain, edge_share: 0.9 }
+    }
+
+    fn leaving(silhouettes: &[Silhouette]) -> Leaving {
+        let mut leaving = Leaving::default();
+        for silhouette in silhouettes {
+            leaving.add_silhouette(*silhouette);
+        }
+        leaving
+    }
+
+    /// What the heights show of two cartons of one height, 10 mm apart.
+    const BOTH: Rectangle = Rectangle {
+        x_mm: 0.0,
+        y_mm: 0.0,
+        yaw: 0.0,
+        length_mm: 410.0,
+        width_mm: 150.0,
+        score_mm: 0.0,
+        sides: [1.0; 4],
+    };
+
+    #[test]
+    fn two_cartons_that_hardly_part_are_two_and_say_merged() {
+        let mut leaving =
+            leaving(&[silhouette(-105.0, 200.0, true), silhouette(105.0, 200.0, true)]);
+        assert!(leaving.is_parted(&BOTH));
+        assert!(leaving.silhouettes.iter().all(|s| s.record.flags.has(Flags::MERGED)));
+    }
+
+    #[test]
+    fn two_labels_on_a_carton_do_not_part_it() {
+        let mut leaving = leaving(&[silhouette(-105.0, 90.0, true), silhouette(105.0, 90.0, true)]);
+        assert!(!leaving.is_parted(&BOTH));
+        assert!(leaving.silhouettes.iter().all(|s| s.record.flags.is_empty()));
+    }
+
+    #[test]
+    fn a_silhouette_is_taken_by_the_pass_at_its_place_alone() {
+        let (here, ahead) = (silhouette(0.0, 400.0, true), silhouette(900.0, 400.0, true));
+        let mut leaving = leaving(&[here, ahead]);
+        assert_eq!(leaving.take_silhouette(&BOTH).expect("there").place, here.place);
+        assert!(leaving.take_silhouette(&BOTH).is_none());
+        let label = Rectangle { x_mm: 900.0, length_mm: 80.0, ..BOTH };
+        assert!(leaving.take_silhouette(&label).is_none());
+        assert_eq!(leaving.silhouette_around(&label).expect("there").place, ahead.place);
+    }
+
+    #[test]
+    fn what_finds_no_room_is_counted() {
+        let all = [silhouette(0.0, 100.0, true); LEAVING_MAX + 3];
+        assert_eq!(leaving(&all).overflows, 3);
+    }
 }

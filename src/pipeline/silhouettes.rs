@@ -67,7 +67,7 @@ impl Pipeline {
     }
 
     /// Whether something of these sides is as large as the smallest parcel.
-    fn counts(&self, [length_mm, width_mm]: [f64; 2]) -> bool {
+    pub(super) fn counts(&self, [length_mm, width_mm]: [f64; 2]) -> bool {
         let segment = &self.site.config.segment;
         let side_min_mm = segment.side_min_mm.unwrap_or(SIDE_MIN_PX * self.site.view.mm_per_px);
         length_mm * width_mm >= segment.area_min_mm2 && length_mm.min(width_mm) >= side_min_mm

@@ -18,6 +18,8 @@ use crate::units::BeltRect;
 
 /// Columns of cells between two looks for parcels.
 const LOOK_COLUMNS: i64 = 8;
+/// A silhouette in doubt waits so far behind the zone's end at most, share of the zone: looks need a frame each.
+const LATE_MAX_SHARE: f64 = 0.1;
 /// Before any column: they begin anywhere.
 const NONE_TAKEN: i64 = i64::MIN / 2;
 
@@ -165,10 +167,14 @@ impl Passes {
         self.parcels.contradict(place, height_mm)
     }
 
-    /// Whether all parcels at a place were passed on, or it has left the zone where the belt comes in.
+    /// Whether all parcels at a place were passed on. Nobody waits for more when it has left the zone where the belt comes
+    /// in, or, past its end, when there is more to look at than there are frames.
     pub fn has_settled(&self, place: &Rectangle) -> bool {
         let leading_mm = place.x_mm + place.reach_mm();
-        place.trailing_mm() > self.settled_mm || leading_mm < self.zone.x_min_mm - self.at.travel_mm
+        let late_mm = place.trailing_mm() - self.end_mm();
+        place.trailing_mm() > self.settled_mm
+            || leading_mm < self.zone.x_min_mm - self.at.travel_mm
+            || late_mm > LATE_MAX_SHARE * self.zone.length_mm()
     }
 
     /// The zone's end, X less the belt's travel, mm.
