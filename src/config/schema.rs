@@ -274,7 +274,7 @@ impl Default for Limits {
             runs_max: 16384,
             blobs_max: 512,
             views_per_track_max: 96,
-            frames_queued_max: 3,
+            frames_queued_max: 8,
         }
     }
 }

@@ -127,14 +127,14 @@ impl Passes {
             self.parcels.take_columns(&self.evidence);
             self.busy = true;
         }
-        if self.busy {
+        // One of the two a frame: each costs as much as several frames.
+        if !self.emit_passed(end_mm, emit) && self.busy {
             self.busy = self.look(false);
             if !self.busy {
                 self.emit_left_over(end_mm, emit);
                 self.settled_mm = end_mm;
             }
         }
-        self.emit_passed(end_mm, emit);
     }
 
     /// The belt has ended: what was seen at all is all that comes.
@@ -197,10 +197,14 @@ impl Passes {
         parcels.look(views, ended, |face| fit.cuboid(views, face))
     }
 
-    fn emit_passed(&mut self, end_mm: f64, emit: &mut dyn FnMut(&Passed)) {
+    /// Returns whether there was any.
+    fn emit_passed(&mut self, end_mm: f64, emit: &mut dyn FnMut(&Passed)) -> bool {
+        let mut any = false;
         while let Some(face) = self.parcels.next_passed(end_mm) {
             self.measure(&face, emit);
+            any = true;
         }
+        any
     }
 
     fn emit_left_over(&mut self, end_mm: f64, emit: &mut dyn FnMut(&Passed)) {
