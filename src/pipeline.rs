@@ -436,12 +436,14 @@ impl Pipeline {
         self.site.view.belt_point(px).x + ahead_mm
     }
 
-    /// Frames at which a parcel, by slot, passed the middle of the zone: where its record holds.
-    pub fn reference_frames(&self) -> impl Iterator<Item = (usize, u64)> + '_ {
+    /// Frames at which a record that is still to come may hold.
+    pub fn reference_frames(&self) -> impl Iterator<Item = u64> + '_ {
         let tracks = self.tracker.tracks().iter().enumerate();
-        tracks
-            .filter(|(_, t)| t.phase == Phase::Riding)
-            .map(|(slot, _)| (slot, self.references[slot].time.index))
+        let riding = tracks.filter(|(_, t)| t.phase == Phase::Riding);
+        riding
+            .map(|(slot, _)| self.references[slot].time.index)
+            .chain(self.leaving.frames())
+            .chain(self.passes.frames())
     }
 
     /// What was told in the last frame, and what it was decided from.

@@ -224,6 +224,29 @@ fn parcels_that_are_seen_apart_for_a_moment_are_two_and_say_that_they_were_merge
 }
 
 #[test]
+fn a_record_holds_at_the_frame_at_which_the_parcel_s_picture_is_taken() {
+    let parcels = parcel([235.0, 125.0, 70.0], 12.0, [-1150.0, -100.0], "kraft")
+        + &parcel([200.0, 150.0, 120.0], -35.0, [-1500.0, 110.0], "white");
+    let scenario = scenario(190, 500.0, &parcels);
+    let (mut frames, mut pipeline) = run::build(site(&scenario, 500.0)).expect("fits");
+    let mut source = Synthetic::new(scenario).expect("renders");
+    let [width, height] = source.size_px();
+    let (mut pictures, mut records) = (Vec::new(), Vec::new());
+    while let Some(time) = source.next_into(&mut frames[0]).expect("renders") {
+        let raw = Plane::packed(&frames[0], width, height).expect("this size");
+        let before: Vec<u64> = pipeline.reference_frames().collect();
+        let mut told = Vec::new();
+        pipeline.step(raw, time, &mut |record| told.push(record)).expect("this size");
+        // What draws a record keeps these frames, and no others, until it comes.
+        assert!(told.iter().all(|record| before.contains(&record.frame)), "{told:?} {before:?}");
+        records.extend(told);
+        pictures.extend(pipeline.passing_middle().map(|_| time.index));
+    }
+    assert_eq!(records.len(), 2, "{records:?}");
+    assert!(records.iter().all(|r| pictures.contains(&r.frame)), "{records:?} {pictures:?}");
+}
+
+#[test]
 fn what_passes_beside_the_zone_is_not_reported() {
     let beside = parcel([100.0, 60.0, 50.0], 0.0, [-900.0, 300.0], "white");
     let scenario = scenario(150, 500.0, &beside);

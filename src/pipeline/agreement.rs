@@ -36,7 +36,18 @@ pub(super) fn agreed(
     record.flags.set(Flags::UNFINISHED, both(Flags::UNFINISHED));
     record.flags.set(Flags::LOST, silhouettes.flags.has(Flags::LOST));
     record.flags.set(Flags::CLIPPED, either(Flags::CLIPPED));
-    record
+    if silhouettes.not_measured.is_none() { held_at(record, silhouettes) } else { record }
+}
+
+/// The same parcel where it was at another record's frame: that of the silhouettes is where its picture is taken.
+fn held_at(record: ParcelRecord, other: &ParcelRecord) -> ParcelRecord {
+    ParcelRecord {
+        frame: other.frame,
+        t_s: other.t_s,
+        x_mm: record.x_mm + other.belt_travel_mm - record.belt_travel_mm,
+        belt_travel_mm: other.belt_travel_mm,
+        ..record
+    }
 }
 
 /// Where another cuboid was seen than in a record, by more than the sigmas, its sigmas span both.
@@ -160,6 +171,18 @@ pub(super) mod tests {
         let record = told(&lost, &record([200.0, 150.0, 60.0], 0.5));
         assert_eq!((record.length_mm, record.not_measured), (200.0, None));
         assert!(record.flags.has(Flags::LOST));
+    }
+
+    #[test]
+    fn what_both_saw_is_told_where_its_picture_is_taken() {
+        let frame = |frame, x_mm, belt_travel_mm| ParcelRecord {
+            frame,
+            x_mm,
+            belt_travel_mm,
+            ..record([200.0, 150.0, 60.0], 0.5)
+        };
+        let (seen, heights) = (frame(30, 4.0, 500.0), frame(32, 39.0, 535.0));
+        assert_eq!(told(&seen, &heights), frame(30, 4.0, 500.0));
     }
 
     #[test]

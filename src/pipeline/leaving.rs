@@ -94,6 +94,11 @@ impl Leaving {
         self.told.clear();
     }
 
+    /// Frames at which the records of what is leaving hold.
+    pub fn frames(&self) -> impl Iterator<Item = u64> + '_ {
+        self.silhouettes.iter().map(|silhouette| silhouette.record.frame)
+    }
+
     fn is_told(&self, place: &Rectangle) -> bool {
         self.told.iter().any(|told| told.place.overlaps(place))
     }

@@ -57,8 +57,8 @@ impl Annotator {
                 self.first_error.get_or_insert(e);
             }
         }
-        self.kept.retain(|&kept, _| pipeline.reference_frames().any(|(_, f)| f == kept));
-        if pipeline.reference_frames().any(|(_, f)| f == index) {
+        self.kept.retain(|&kept, _| pipeline.reference_frames().any(|f| f == kept));
+        if pipeline.reference_frames().any(|f| f == index) {
             self.kept.insert(index, raw.to_vec());
         }
     }

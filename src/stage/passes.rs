@@ -187,6 +187,11 @@ impl Passes {
         self.parcels.overflows()
     }
 
+    /// Frames of the views that are kept.
+    pub fn frames(&self) -> impl Iterator<Item = u64> + '_ {
+        self.views.places().map(|place| self.views.kept(place).time.index)
+    }
+
     /// Heights of the belt.
     pub fn evidence(&self) -> &Evidence {
         &self.evidence
