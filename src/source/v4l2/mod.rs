@@ -42,6 +42,8 @@ pub struct V4l2 {
     size_px: [usize; 2],
     /// Buffers of the plan in whose place driver's ones were lent.
     spare: Vec<Block<u8>>,
+    /// Pictures are looked at in the driver's buffers, without a copy.
+    lends: bool,
     sequence: Option<(u32, u64)>,
 }
 
@@ -62,7 +64,8 @@ impl V4l2 {
         set_controls(&device, settings)?;
         let ring = Ring::start(device).map_err(|e| failed("cannot stream", &e))?;
         let spare = Vec::with_capacity(ring.len());
-        Ok(Self { ring, format, stride, size_px, spare, sequence: None })
+        let lends = format == PixelFormat::Mono8;
+        Ok(Self { ring, format, stride, size_px, spare, lends, sequence: None })
     }
 
     /// A driver's buffer goes back to the driver; from here on `buffer` is one of the plan's.
@@ -97,7 +100,12 @@ impl V4l2 {
         let needed = self.stride * (height - 1) + width;
         let compressed = self.format == PixelFormat::Jpeg;
         let bytes = filled.bytes.min(filled.block_len());
-        let lend = self.format == PixelFormat::Mono8 && self.ring.queued() >= QUEUED_MIN;
+        if self.ring.is_lent(filled.index) {
+            // As v4l2loopback does when frames wait long: from here on they are copied.
+            self.lends = false;
+            return Ok(false);
+        }
+        let lend = self.lends && self.ring.queued() >= QUEUED_MIN;
         if filled.damaged || (!compressed && bytes < needed) {
             self.ring.requeue(filled.index)?;
             return Ok(false);
@@ -133,7 +141,9 @@ impl Driver for V4l2 {
         let filled = self.ring.dequeue(WAIT).map_err(|e| lost(&e))?;
         let Some(filled) = filled else { return Ok(false) };
         self.unwrapped(filled.sequence);
-        self.ring.requeue(filled.index).map_err(|e| lost(&e))?;
+        if !self.ring.is_lent(filled.index) {
+            self.ring.requeue(filled.index).map_err(|e| lost(&e))?;
+        }
         Ok(true)
     }
 }

@@ -102,6 +102,11 @@ impl Ring {
         self.slots.iter().position(|slot| std::ptr::eq(slot.start, block.as_ptr()))
     }
 
+    /// Whether a buffer is not the driver's to fill.
+    pub fn is_lent(&self, index: usize) -> bool {
+        self.slots[index].block.is_none()
+    }
+
     /// The contents of a filled buffer.
     pub fn bytes(&self, index: usize) -> &[u8] {
         self.slots[index].block.as_deref().unwrap_or(&[])
