@@ -157,9 +157,10 @@ fn a_camera_that_is_unplugged_is_told_and_comes_back() {
         assert_eq!(appliance.status("boots"), restarts, "without a restart");
         appliance.wait("all is well", "reason", is_well);
     }
-    // Every format that a driver may deliver; the appliance lets the device go.
+    // Every format that a driver may deliver; the appliance lets the device go, after it has told what is in the zone: in an
+    // emulated machine that takes seconds.
     appliance
-        .run("mv /data/store/current /data/store/gone; kill -TERM $(pidof beltgauge); sleep 3");
+        .run("mv /data/store/current /data/store/gone; kill -TERM $(pidof beltgauge); sleep 15");
     let formats = appliance.run("/tmp/hil/guest formats /dev/video1");
     println!("{formats}");
     assert!(formats.contains("all formats"));
