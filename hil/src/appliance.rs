@@ -16,8 +16,9 @@ use std::process::Command;
 use std::time::{Duration, Instant};
 
 /// Frames a second of the camera: what an emulated processor can do.
-const FPS: f64 = 10.0;
-const SPEED_MM_PER_S: f64 = 200.0;
+/// An emulated processor needs 0.2 s for a frame.
+const FPS: f64 = 4.0;
+const SPEED_MM_PER_S: f64 = 80.0;
 /// The belt is empty at first for so long: the appliance starts and learns it.
 const EMPTY_MM: f64 = 1400.0;
 /// Length, width, height of the parcels, which come again and again.
@@ -136,7 +137,7 @@ impl Bench {
         let text = format!(
             "[camera]\ncalibration = \"camera.toml\"\ndevice = \"{device}\"\n{more}\n[zone]\n\
              x_min_mm = -500\nx_max_mm = 500\ny_min_mm = -300\ny_max_mm = 300\n[belt]\n\
-             speed_mm_per_s = 204\n{can}[plc]\nqueue = true\nscale_interval_mm = {scale_interval_mm}\n\
+             speed_mm_per_s = 81.6\n{can}[plc]\nqueue = true\nscale_interval_mm = {scale_interval_mm}\n\
              [modbus]\nwrite_allow = [\"0.0.0.0\"]\n"
         );
         std::fs::write(folder.join("beltgauge.toml"), text).expect("room");
