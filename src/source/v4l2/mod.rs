@@ -27,8 +27,9 @@ use v4l::{Device, Format, Fraction};
 const NODES: usize = 64;
 /// How long one call waits for a frame: whoever wants the thread to end waits as long.
 const WAIT: Duration = Duration::from_millis(200);
-/// The driver keeps so many buffers to fill, whatever the pipeline does with the others.
-const QUEUED_MIN: usize = 2;
+/// The driver keeps so many buffers to fill, half of them, whatever the pipeline does with the others: v4l2loopback fills what is
+/// lent when fewer are left. Beyond that pictures are copied.
+const QUEUED_MIN: usize = 4;
 /// Units of `V4L2_CID_EXPOSURE_ABSOLUTE`.
 const EXPOSURE_UNIT_US: f64 = 100.0;
 /// `V4L2_EXPOSURE_MANUAL`.
