@@ -12,7 +12,7 @@ use super::pixels::{PixelFormat, by_fourcc};
 use crate::config::CameraTable;
 use crate::error::{Error, Result};
 use crate::plan::Block;
-use ring::{Filled, Ring};
+use ring::{BUFFERS, Filled, Ring};
 use rustix::time::{ClockId, clock_gettime};
 use std::io;
 use std::path::{Path, PathBuf};
@@ -27,9 +27,8 @@ use v4l::{Device, Format, Fraction};
 const NODES: usize = 64;
 /// How long one call waits for a frame: whoever wants the thread to end waits as long.
 const WAIT: Duration = Duration::from_millis(200);
-/// The driver keeps so many buffers to fill, half of them, whatever the pipeline does with the others: v4l2loopback fills what is
-/// lent when fewer are left. Beyond that pictures are copied.
-const QUEUED_MIN: usize = 4;
+/// The driver keeps so many buffers to fill, whatever the pipeline does with the others.
+const QUEUED_MIN: usize = 2;
 /// Units of `V4L2_CID_EXPOSURE_ABSOLUTE`.
 const EXPOSURE_UNIT_US: f64 = 100.0;
 /// `V4L2_EXPOSURE_MANUAL`.
@@ -65,7 +64,8 @@ impl V4l2 {
         set_controls(&device, settings)?;
         let ring = Ring::start(device).map_err(|e| failed("cannot stream", &e))?;
         let spare = Vec::with_capacity(ring.len());
-        let lends = format == PixelFormat::Mono8;
+        // With fewer buffers than were asked for, v4l2loopback's 8 for one, a frame that waits may be filled anew.
+        let lends = format == PixelFormat::Mono8 && ring.len() >= BUFFERS as usize;
         Ok(Self { ring, format, stride, size_px, spare, lends, sequence: None })
     }
 
@@ -102,7 +102,7 @@ impl V4l2 {
         let compressed = self.format == PixelFormat::Jpeg;
         let bytes = filled.bytes.min(filled.block_len());
         if self.ring.is_lent(filled.index) {
-            // As v4l2loopback does when frames wait long: from here on they are copied.
+            // The driver fills what it had not got back: from here on its pictures are copied.
             self.lends = false;
             return Ok(false);
         }

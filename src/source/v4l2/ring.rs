@@ -15,7 +15,7 @@ use v4l::v4l_sys::{
 use v4l::v4l2::vidioc;
 
 /// Buffers that are asked for: what a pipeline holds at once, and what the driver fills meanwhile.
-const BUFFERS: u32 = 8;
+pub const BUFFERS: u32 = 12;
 
 /// A buffer that the driver has filled.
 pub struct Filled {
