@@ -15,8 +15,7 @@ use std::path::{Path, PathBuf};
 use std::process::Command;
 use std::time::{Duration, Instant};
 
-/// Frames a second of the camera: what an emulated processor can do.
-/// An emulated processor needs 0.2 s for a frame.
+/// Frames a second of the camera: an emulated processor needs 0.2 s for one.
 const FPS: f64 = 4.0;
 const SPEED_MM_PER_S: f64 = 80.0;
 /// The belt is empty at first for so long: the appliance starts and learns it.
