@@ -19,6 +19,22 @@ async fn the_bundle_is_gzip(browser: &Browser) {
     assert_eq!(browser.run(&begins).await, 0x1f8b, "it is gzip");
 }
 
+/// Older ones come from the archive.
+async fn the_archive_s_parcels_open(browser: &Browser) {
+    browser.run("[...document.querySelectorAll('main button')].at(-1).click()").await;
+    let archived = "return [...document.querySelectorAll('img')].some((image) => image.src.includes('/api/archive/') )";
+    browser.wait("the archive", archived).await;
+    // The oldest that has a picture: what only the heights showed has none.
+    let oldest =
+        "[...document.querySelectorAll('tbody tr')].filter((row) => row.querySelector('img')
+        ?.src.includes('/api/archive/')).at(-1).querySelector('td button.link').click()";
+    browser.run(oldest).await;
+    browser.run("document.querySelector('#dialog a').click()").await;
+    let kept = "return location.hash.startsWith('#parcel/archive/')
+        && document.querySelector('main img')?.naturalWidth > 20";
+    browser.wait("a parcel of the archive", kept).await;
+}
+
 #[tokio::test(flavor = "multi_thread")]
 async fn the_page_shows_pictures_and_parcels_in_both_languages_and_its_console_is_silent() {
     let demo = Demo::start("web", 600, false);
@@ -106,19 +122,7 @@ async fn the_page_shows_pictures_and_parcels_in_both_languages_and_its_console_i
     browser.run("location.hash = '#parcels'").await;
     browser.wait("the link", "return document.querySelector('a[download]') !== null").await;
 
-    // Older ones come from the archive.
-    browser.run("[...document.querySelectorAll('main button')].at(-1).click()").await;
-    let archived = "return [...document.querySelectorAll('img')].some((image) => image.src.includes('/api/archive/') )";
-    browser.wait("the archive", archived).await;
-    // The oldest that has a picture: what only the heights showed has none.
-    let oldest =
-        "[...document.querySelectorAll('tbody tr')].filter((row) => row.querySelector('img')
-        ?.src.includes('/api/archive/')).at(-1).querySelector('td button.link').click()";
-    browser.run(oldest).await;
-    browser.run("document.querySelector('#dialog a').click()").await;
-    let kept = "return location.hash.startsWith('#parcel/archive/')
-        && document.querySelector('main img')?.naturalWidth > 20";
-    browser.wait("a parcel of the archive", kept).await;
+    the_archive_s_parcels_open(&browser).await;
 
     // German and dark.
     browser.run("document.getElementById('language').click()").await;
