@@ -47,6 +47,7 @@ impl<'a> Plane<'a> {
     }
 
     /// Row `y`, exactly `width` bytes.
+    #[inline]
     pub fn row(&self, y: usize) -> &'a [u8] {
         &self.data[y * self.stride..][..self.width]
     }
@@ -62,26 +63,36 @@ impl<'a> Plane<'a> {
     }
 
     /// Value at column `x`, row `y`.
+    #[inline]
     pub fn at(&self, x: usize, y: usize) -> u8 {
         self.row(y)[x]
     }
 
+    /// Whether pixels surround (`x`, `y`): inside the outermost pixel centres.
+    #[inline]
+    pub fn surrounds(&self, x: f32, y: f32) -> bool {
+        let inside = |at: f32, size: usize| at >= 0.0 && at < size.saturating_sub(1) as f32;
+        inside(x, self.width) && inside(y, self.height)
+    }
+
     /// Bilinear value at (`x`, `y`); `None` outside the outermost pixel centres.
+    #[inline]
     pub fn sample(&self, x: f32, y: f32) -> Option<f32> {
-        let inside = x >= 0.0
-            && y >= 0.0
-            && x < self.width.saturating_sub(1) as f32
-            && y < self.height.saturating_sub(1) as f32;
-        if !inside {
-            return None;
-        }
-        let (column, row) = (x as usize, y as usize);
+        self.surrounds(x, y).then(|| self.between(x, y))
+    }
+
+    /// Bilinear value at a point that pixels surround, but for rounding.
+    #[inline]
+    pub(crate) fn between(&self, x: f32, y: f32) -> f32 {
+        let column = (x as usize).min(self.width.saturating_sub(2));
+        let row = (y as usize).min(self.height.saturating_sub(2));
         let (fx, fy) = (x - column as f32, y - row as f32);
-        let top = &self.row(row)[column..column + 2];
-        let bottom = &self.row(row + 1)[column..column + 2];
+        let first = row * self.stride + column;
+        let top = &self.data[first..first + 2];
+        let bottom = &self.data[first + self.stride..first + self.stride + 2];
         let lerp =
             |pair: &[u8]| f32::from(pair[0]) + fx * (f32::from(pair[1]) - f32::from(pair[0]));
         let (t, b) = (lerp(top), lerp(bottom));
-        Some(t + fy * (b - t))
+        t + fy * (b - t)
     }
 }

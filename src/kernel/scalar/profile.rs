@@ -31,14 +31,20 @@ pub fn sample(
     let length = step[0].hypot(step[1]).max(f32::MIN_POSITIVE);
     let across = [-step[1] / length, step[0] / length];
     let scale = 1.0 / (2 * half_width + 1) as f32;
+    let at = |i: f32, w: f32| {
+        [start[0] + i * step[0] + w * across[0], start[1] + i * step[1] + w * across[1]]
+    };
+    // All lie between these four.
+    let (last, w) = (profile.len().saturating_sub(1) as f32, half_width as f32);
+    let corners = [at(0.0, -w), at(0.0, w), at(last, -w), at(last, w)];
+    if !corners.into_iter().all(|[x, y]| image.surrounds(x, y)) {
+        return None;
+    }
     for (i, out) in profile.iter_mut().enumerate() {
-        let i = i as f32;
         let mut sum = 0.0;
         for w in -half_width..=half_width {
-            let w = w as f32;
-            let x = start[0] + i * step[0] + w * across[0];
-            let y = start[1] + i * step[1] + w * across[1];
-            sum += image.sample(x, y)?;
+            let [x, y] = at(i as f32, w as f32);
+            sum += image.between(x, y);
         }
         *out = sum * scale;
     }

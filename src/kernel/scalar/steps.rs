@@ -33,8 +33,13 @@ pub fn take_steps(rows: Rows<'_>, along: &mut [i8], across: &mut [i8]) {
 fn stored([x, y]: [f32; 2]) -> [i8; 2] {
     let length = STEP_ONE * (x * x + y * y).sqrt();
     let scale = STEP_ONE * STEP_MOST / length.max(STEP_MOST);
-    // Rounded to the nearest: a cast cuts off.
-    [x, y].map(|step| (scale * step + 0.5_f32.copysign(step)) as i32 as i8)
+    [rounded(scale * x), rounded(scale * y)]
+}
+
+/// To the nearest: a cast cuts off. No closure: those are not compiled for the level.
+#[inline(always)]
+fn rounded(step: f32) -> i8 {
+    (step + 0.5_f32.copysign(step)) as i32 as i8
 }
 
 #[cfg(test)]

@@ -125,8 +125,10 @@ impl Normal {
 
     /// Add `weight * residual^2`; `row` is the derivative of the prediction.
     fn add(&mut self, residual: f64, row: &SVector<f64, N>, weight: f64) {
-        self.matrix.ger(weight, row, row, 1.0);
-        self.vector.axpy(weight * residual, row, 1.0);
+        for (mut column, &value) in self.matrix.column_iter_mut().zip(row) {
+            column += row * (weight * value);
+        }
+        self.vector += row * (weight * residual);
         self.cost += weight * residual * residual;
     }
 
