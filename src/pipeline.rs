@@ -203,6 +203,7 @@ impl Pipeline {
         self.counters.frames += 1;
 
         self.rectify.step(raw);
+        self.odometry.look_at_raw(raw);
         self.hold_background();
         self.background.step(self.rectify.pixels(), self.rectify.seen(), &self.hold);
         let by_encoder = self.witnesses.encoder_step_mm();
@@ -258,6 +259,10 @@ impl Pipeline {
         let grey = self.rectify.pixels();
         let texture = self.odometry.step(grey, &self.background, &self.covered, ride, dt_s);
         let decided = self.witnesses.decide(by_encoder, texture, &self.odometry, ride, dt_s);
+        let by_texture = self.witnesses.encoder_speed_mm_per_s().is_none();
+        if by_texture && self.odometry.follows_blocks() {
+            self.at.doubt(decided.motion.step_mm);
+        }
         if decided.changed {
             self.at.lose();
         }

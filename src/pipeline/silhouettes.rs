@@ -45,9 +45,10 @@ impl Pipeline {
         }
         // A pass that was cut short counts only if edges were found.
         let measured = measured.filter(|m| m.has_edges || flags == Flags::default());
-        // What vanished before it had a shape was a hand, or a piece that joined its parcel, unless it
-        // has ridden through most of the zone, as large as a parcel: a sorter must know of it.
-        let vanished = measured.is_none() && reason == NotMeasured::Lost && !had_shape;
+        // What vanished, or was cut short, before it had a shape was a hand, or a piece that joined its parcel, unless
+        // it has ridden through most of the zone, as large as a parcel: a sorter must know of it.
+        let cut_short = reason == NotMeasured::Lost || flags.has(Flags::UNFINISHED);
+        let vanished = measured.is_none() && cut_short && !had_shape;
         if vanished && !self.rode(slot) {
             return;
         }

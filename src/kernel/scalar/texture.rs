@@ -1,8 +1,10 @@
 //! Belt texture: taking it out of a row of the view, and matching two rows: the specification.
 //!
 //! Texture is in 1/16 grey level on a plain belt, in coarser units on one of strong texture.
+#![expect(clippy::inline_always, reason = "only inlined code is compiled for its level")]
 
 use super::mixture::{Gain, observation};
+use std::ops::Range;
 
 /// Value of a pixel that shows no belt texture (foreground, not seen).
 pub const NO_TEXTURE: i8 = i8::MIN;
@@ -103,12 +105,49 @@ impl Sums {
     }
 }
 
-/// The pixels of `key` and `current` that lie on each other when `current` has moved by `shift`.
+/// The pixels of a key row and a current row, so long, that lie on each other when the current one has moved by `shift`.
+pub fn overlap_range(key: usize, current: usize, shift: isize) -> (Range<usize>, Range<usize>) {
+    let first = shift.unsigned_abs();
+    let (from, to) = if shift < 0 { (first.min(key), 0) } else { (0, first.min(current)) };
+    let n = (key - from).min(current - to);
+    (from..from + n, to..to + n)
+}
+
+/// The same pixels.
 pub fn overlap<'a>(key: &'a [i8], current: &'a [i8], shift: isize) -> (&'a [i8], &'a [i8]) {
-    let key = key.get((-shift).max(0) as usize..).unwrap_or_default();
-    let current = current.get(shift.max(0) as usize..).unwrap_or_default();
-    let n = key.len().min(current.len());
-    (&key[..n], &current[..n])
+    let (from, to) = overlap_range(key.len(), current.len(), shift);
+    (&key[from], &current[to])
+}
+
+/// Means over several frames, of a row.
+pub struct Means<'a> {
+    /// The means, rounded.
+    pub texture: &'a mut [i8],
+    /// The means.
+    pub mean: &'a mut [f32],
+    /// Frames in each.
+    pub frames: &'a mut [u8],
+}
+
+/// Add a row to the means of fewer than `frames_max` frames, between two of its pixels: `fraction` of the way to the next.
+/// `current` is one pixel longer.
+#[inline(always)]
+pub fn add_to_means(current: &[i8], fraction: f32, frames_max: u8, means: &mut Means<'_>) {
+    let n = means.texture.len();
+    let (left, right) = (&current[..n], &current[1..][..n]);
+    let (mean, frames) = (&mut means.mean[..n], &mut means.frames[..n]);
+    for i in 0..n {
+        let is_known = left[i] != NO_TEXTURE && right[i] != NO_TEXTURE;
+        let (here, next) = (f32::from(left[i]), f32::from(right[i]));
+        let value = here + fraction * (next - here);
+        let is_added = is_known && frames[i] < frames_max;
+        let count = frames[i] + u8::from(is_added);
+        let weight = if is_added { 1.0 / f32::from(count) } else { 0.0 };
+        mean[i] += weight * (value - mean[i]);
+        frames[i] = count;
+        let rounded = (mean[i] + 0.5_f32.copysign(mean[i])) as i32 as i8;
+        means.texture[i] = if count > 0 { rounded } else { NO_TEXTURE };
+    }
 }
 
 /// Add the products of `key[i]` and `current[i + shift]` over their overlap.

@@ -1,8 +1,10 @@
 //! [`crate::kernel::scalar::texture`] in vectors.
 
 use super::mixture::brighten;
+pub use crate::kernel::scalar::texture::Means;
 use crate::kernel::scalar::texture::{
-    Belt, COUNT_BITS, NO_TEXTURE, SUMS_BORDER, Sums, TEXTURE_MAX, overlap, running_sums,
+    self as scalar, Belt, COUNT_BITS, NO_TEXTURE, SUMS_BORDER, Sums, TEXTURE_MAX, overlap,
+    running_sums,
 };
 use fearless_simd::{Level, dispatch, prelude::*};
 
@@ -24,6 +26,17 @@ pub fn extract(
         running_sums(out, sums);
         remove_shading(out, sums);
     });
+}
+
+/// Add a row to the means of fewer than `frames_max` frames, between two of its pixels.
+pub fn add_to_means(
+    level: Level,
+    current: &[i8],
+    fraction: f32,
+    frames_max: u8,
+    means: &mut Means<'_>,
+) {
+    dispatch!(level, _simd => scalar::add_to_means(current, fraction, frames_max, means));
 }
 
 #[inline(always)]
@@ -101,7 +114,6 @@ fn products(key: &[i8], current: &[i8], sums: &mut Sums) {
 mod tests {
     use super::*;
     use crate::kernel::scalar::mixture::Gain;
-    use crate::kernel::scalar::texture as scalar;
     use crate::kernel::simd::each_level;
 
     const N: usize = 5 * 64;
@@ -112,6 +124,35 @@ mod tests {
             state = state.wrapping_mul(6_364_136_223_846_793_005).wrapping_add(1);
             state >> 33
         }
+    }
+
+    type Row = ([i8; N], [f32; N], [u8; N]);
+
+    fn means_of(mut add: impl FnMut(&[i8], f32, u8, &mut Means<'_>)) -> Row {
+        let mut next = random(3);
+        let mut row: Row = ([NO_TEXTURE; N], [0.0; N], [0; N]);
+        for frames_max in [16, 16, 16, 16, 16, 3] {
+            let current: [i8; N + 1] = std::array::from_fn(|i| {
+                let grey = (next() % 225) as i8;
+                if i < 8 || next().is_multiple_of(4) { NO_TEXTURE } else { grey }
+            });
+            let fraction = (next() % 1000) as f32 / 1000.0;
+            let (texture, mean, frames) = (&mut row.0[..], &mut row.1[..], &mut row.2[..]);
+            add(&current, fraction, frames_max, &mut Means { texture, mean, frames });
+        }
+        row
+    }
+
+    #[test]
+    fn every_level_averages_as_the_specification() {
+        let expected = means_of(scalar::add_to_means);
+        assert!((0..=5).all(|frames| expected.2.contains(&frames)), "some of each");
+        each_level(|level| {
+            let add = |current: &[i8], fraction, most, means: &mut Means<'_>| {
+                add_to_means(level, current, fraction, most, means);
+            };
+            assert_eq!(means_of(add), expected);
+        });
     }
 
     #[test]

@@ -1,6 +1,6 @@
 //! The belt's travel over a gap in the frames, by its texture before and after.
 
-use super::{Knowledge, MATCH_MIN, Odometry, PAIRS_MIN, RIDE_MARGIN, STANDSTILL_GREY_MIN, chance};
+use super::{Knowledge, MATCH_MIN, Odometry, PAIRS_MIN, RIDE_MARGIN, TEXTURE_GREY_MIN, chance};
 use crate::stage::background::Background;
 
 /// Over a gap so much is looked at, once and on all rows: a parcel is still in view.
@@ -45,7 +45,7 @@ impl Odometry {
         let (from, to) = if forward { (-back, most) } else { (-most, back) };
         let found = self.best(from, to).filter(|m| {
             m.rho > chance(m.pairs).max(MATCH_MIN)
-                && (m.shift_px.abs() > 2.0 || m.texture_grey >= STANDSTILL_GREY_MIN)
+                && (m.shift_px.abs() > 2.0 || m.texture_grey >= TEXTURE_GREY_MIN)
         });
         let half = self.shift_max_px();
         let peaks = self.peaks(-half, half, None);
@@ -54,7 +54,7 @@ impl Odometry {
             let [here, ..] = self.correlations(0);
             self.take_key();
             // A faint texture may well not show what a gap's one look needs.
-            let was_clear = was_known && !self.faint;
+            let was_clear = was_known && self.rho >= MATCH_MIN;
             let would_show = follows && was_clear && here.pairs >= 2 * PAIRS_MIN;
             return if would_show {
                 Across::Beyond(most * self.mm_per_px)

@@ -1,16 +1,17 @@
 //! Belt motion from the belt's own texture: the witness that makes heights possible.
 //!
 //! In: belt view minus background, free belt only. Out: travel since the last frame, whether
-//! it was measured. Owns: the texture of a key frame and of the current one.
+//! it was measured. Owns: the texture of a key and of the current frame.
 //! The current texture is matched with the key's, not with the last frame's, so errors do
-//! not add up frame by frame; a new key is taken when the overlap gets small. In the belt
-//! view all belt motion is horizontal, so a match is one number.
+//! not add up frame by frame; another frame is the key when the overlap gets small. Where noise is stronger than the
+//! texture, the key moves on with the belt instead, and its noise is averaged. In the belt view all belt motion is
+//! horizontal, so a match is one number.
 //! While it is not locked, a few of the rows are searched over every speed in both directions, and
 //! several frames must agree; but a whole multiple of the last step is one at once: frames are missing
 //! whose time stamps do not tell. A texture fainter than the camera's noise is searched on all rows, in
-//! every frame: a few show neither it nor its rivals. A texture that fits itself at several plausible
-//! shifts is ambiguous, and silhouettes that move otherwise refute what the texture shows: neither is a
-//! measurement.
+//! every frame: a few show neither it nor its rivals. Of a texture that fits itself at several shifts, as a modular belt's,
+//! that one is taken which is the only one near the configured speed, or near the last step; if there are more, it is
+//! ambiguous, and silhouettes that move otherwise refute what the texture shows: neither is a measurement.
 //! Cost: at most 250,000 pixels taken out, and as many products for each shift tried: 13 when locked on
 //! a clear texture, every speed in both directions on a faint one; bounded by the zone, whatever the
 //! time stamps say.
@@ -18,21 +19,26 @@
 //! through three shifts is off by 0.05 px, always towards the same side at the same speed.
 
 mod across;
+mod blocks;
 mod correlation;
+mod key;
 mod peaks;
+mod search;
 
 pub use across::Across;
 
-use correlation::{Correlation, MATCH_MIN, Match, chance, match_min};
-use peaks::{LIKE_HEIGHT, PEAK_HALF, PEAK_SHIFTS, Peaks, peak};
+use blocks::Blocks;
+use correlation::{MATCH_MIN, Match, chance};
+use key::Key;
 
 use crate::camera::BeltView;
 use crate::error::Result;
+use crate::image::Plane;
 use crate::kernel::Level;
 use crate::kernel::bands::{self, BANDS_MAX, Jobs, rows_per_band};
 use crate::kernel::scalar::bits::{self, stride};
-use crate::kernel::scalar::texture::{Belt, NO_TEXTURE, SUMS_BORDER, Sums};
-use crate::kernel::simd::texture::{correlate, extract};
+use crate::kernel::scalar::texture::{Belt, NO_TEXTURE, SUMS_BORDER};
+use crate::kernel::simd::texture::extract;
 use crate::plan::{Block, Memory, Plan};
 use crate::stage::background::Background;
 use crate::stage::riders::Ride;
@@ -42,24 +48,18 @@ use crate::units::{BeltMm, BeltRect};
 const ROW_STEP_MIN: usize = 2;
 /// ... and so many pixels are enough: more cost time and tell next to nothing.
 const TEXTURE_PX: usize = 250_000;
-/// When locked, shifts this far around the prediction are tried.
-const LOCKED_SEARCH_PX: f64 = 1.5;
 /// Pairs of textured pixels below which a match proves nothing.
 const PAIRS_MIN: u32 = 4000;
-/// A new key when the belt has moved on by this share of the zone.
+/// Below this correlation noise is clearly stronger than the texture: two frames share less than a quarter of what either shows.
+const NOISY: f64 = 0.25;
+/// A new key, or the same further on, when the belt has moved by this share of the zone.
 const KEY_TRAVEL: f64 = 0.45;
 
-/// Pixels of the rows that are searched over every speed.
-const SCOUT_PX: usize = 12_000;
 /// Shifts up to this share of the zone leave enough overlap.
 const SHIFT_SHARE: f64 = 0.5;
-/// A speed far from the nominal one is believed when this many frames on end show it ...
-const SCOUT_FRAMES: u32 = 3;
-/// ... within this share.
-const SCOUT_AGREE: f64 = 0.03;
-/// A standstill needs texture of at least this, grey levels: what compression leaves of a plain
-/// belt, frozen from frame to frame, is below 0.1.
-const STANDSTILL_GREY_MIN: f64 = 0.25;
+/// A standstill, and a mean of frames, need texture of at least this, grey levels: what compression leaves of a plain
+/// belt, frozen from frame to frame, is below 0.1, and what parcels and lamps cast on it 0.15.
+const TEXTURE_GREY_MIN: f64 = 0.25;
 /// Below this share of the nominal speed the belt stands.
 const STILL: f64 = 0.1;
 /// Silhouettes move at the belt's speed, or up to the magnification faster, with this margin.
@@ -126,7 +126,12 @@ pub struct Odometry {
     expected: Expected,
     /// Last known speed.
     speed_mm_per_s: f64,
-    key: Block<i8>,
+    /// Of the last frame alone.
+    last_mm_per_s: f64,
+    /// The texture fits itself at other speeds, too.
+    repeats: bool,
+    key: Key,
+    blocks: Blocks,
     current: Block<i8>,
     sums: Block<i32>,
     scout: Block<f32>,
@@ -140,8 +145,8 @@ pub struct Odometry {
     seen: Option<(f64, u32)>,
     knowledge: Knowledge,
     locked: bool,
-    /// The last match was fainter than [`MATCH_MIN`].
-    faint: bool,
+    /// Correlation of the last match.
+    rho: f64,
     /// Frames without a match since the last one.
     misses: u32,
     /// Frames that were missing though the time stamps did not tell.
@@ -176,7 +181,7 @@ impl Odometry {
         let zone = Self::zone_px(view, zone);
         let row = Self::blocks(&zone[0]).len();
         let n = row * zone[1].len().div_ceil(Self::row_step(&zone));
-        plan.add::<i8>("odometry.key", n, "belt texture of the key frame, some of the rows");
+        Key::plan(n, plan);
         plan.add::<i8>("odometry.current", n, "belt texture of the current frame");
         let sums = BANDS_MAX * (row + SUMS_BORDER);
         plan.add::<i32>("odometry.sums", sums, "running sums of a row, for each band");
@@ -194,6 +199,7 @@ impl Odometry {
     ) -> Result<Self> {
         let zone = Self::zone_px(view, zone);
         let row_step = Self::row_step(&zone);
+        let key = Key::new(Self::blocks(&zone[0]).len(), memory)?;
         let [columns, rows] = zone;
         Ok(Self {
             level,
@@ -205,7 +211,10 @@ impl Odometry {
             rows,
             expected,
             speed_mm_per_s: expected.nominal_mm_per_s,
-            key: memory.take("odometry.key", NO_TEXTURE)?,
+            last_mm_per_s: expected.nominal_mm_per_s,
+            repeats: false,
+            key,
+            blocks: Blocks::default(),
             current: memory.take("odometry.current", NO_TEXTURE)?,
             sums: memory.take("odometry.sums", 0)?,
             scout: memory.take("odometry.scout", 0.0)?,
@@ -215,12 +224,17 @@ impl Odometry {
             seen: None,
             knowledge: Knowledge::default(),
             locked: false,
-            faint: false,
+            rho: 0.0,
             misses: 0,
             untold_gaps: 0,
             proofs: 0,
             doubts: (0, false),
         })
+    }
+
+    /// A frame as it came from the camera.
+    pub fn look_at_raw(&mut self, raw: Plane<'_>) {
+        self.blocks.add(raw);
     }
 
     /// One frame, `dt_s` after the last one: `grey`, rows of [`stride`] pixels. `covered`: bit mask
@@ -253,16 +267,14 @@ impl Odometry {
             self.key_age_s += dt_s * f64::from(m.missing);
             let dt_s = dt_s * f64::from(1 + m.missing);
             if dt_s > 0.0 {
-                self.speed_mm_per_s += SPEED_FOLLOW * (step_mm / dt_s - self.speed_mm_per_s);
+                self.last_mm_per_s = step_mm / dt_s;
+                self.speed_mm_per_s += SPEED_FOLLOW * (self.last_mm_per_s - self.speed_mm_per_s);
             }
             self.knowledge = Knowledge::Measured;
-            self.faint = m.rho < MATCH_MIN;
+            self.rho = m.rho;
             self.misses = 0;
             self.shift_px = Some(m.shift_px);
-            let far = m.shift_px.abs() > KEY_TRAVEL * self.columns.len() as f64;
-            if far || m.pairs < PAIRS_MIN * 2 {
-                self.take_key();
-            }
+            self.renew_key(&m);
         } else {
             self.misses += 1;
             self.shift_px = Some(last_px + step_px);
@@ -306,7 +318,12 @@ impl Odometry {
                 let agrees = self.may_carry(speed_mm_per_s, ride);
                 (agrees, steady && !agrees)
             }
-            Ride::Stands | Ride::Unknown => (false, false),
+            // At another of its speeds it stands, too.
+            Ride::Stands => {
+                let still_mm_per_s = STILL * self.expected.nominal_mm_per_s;
+                (false, self.repeats && speed_mm_per_s.abs() > still_mm_per_s)
+            }
+            Ride::Unknown => (false, false),
         };
         let as_expected = (speed_mm_per_s / self.expected.nominal_mm_per_s - 1.0).abs()
             < self.expected.speed_error_max;
@@ -318,7 +335,8 @@ impl Odometry {
         }
         self.doubts.0 += u32::from(contradicts && !self.doubts.1);
         self.doubts.1 = contradicts;
-        let is_proven = self.proofs >= PROOF_FRAMES && self.doubts.0 < DOUBTS_MAX;
+        // A texture that repeats itself was seen to move as expected because that was expected.
+        let is_proven = !self.repeats && self.proofs >= PROOF_FRAMES && self.doubts.0 < DOUBTS_MAX;
         let refuted = contradicts && !is_proven;
         if refuted {
             self.knowledge = Knowledge::Refuted;
@@ -369,14 +387,43 @@ impl Odometry {
         (self.speed_mm_per_s, self.locked)
     }
 
+    /// Whether what a codec's blocks left of the texture was matched, which sticks to them more or less.
+    pub fn follows_blocks(&self) -> bool {
+        self.locked && self.rho < NOISY && self.blocks.are_seen()
+    }
+
     /// Whether the belt is known to stand still (below a tenth of the nominal speed).
     pub fn stands_still(&self) -> bool {
         self.locked && self.speed_mm_per_s.abs() < STILL * self.expected.nominal_mm_per_s
     }
 
     fn take_key(&mut self) {
-        std::mem::swap(&mut self.key, &mut self.current);
+        self.key.replace(&mut self.current);
         (self.shift_px, self.key_age_s, self.seen) = (Some(0.0), 0.0, None);
+    }
+
+    /// After a match: the current frame is the key once the belt has moved on far. Where noise is stronger than the texture,
+    /// the frame is added to the key instead.
+    fn renew_key(&mut self, found: &Match) {
+        let is_far = found.shift_px.abs() > KEY_TRAVEL * self.columns.len() as f64
+            || found.pairs < PAIRS_MIN * 2;
+        // What a codec leaves of the texture sticks to the picture's blocks: a mean would follow them.
+        let is_averaged =
+            found.rho < NOISY && found.texture_grey >= TEXTURE_GREY_MIN && !self.blocks.are_seen();
+        if !is_averaged {
+            if is_far {
+                self.take_key();
+            }
+            return;
+        }
+        let mut shift_px = found.shift_px;
+        if is_far {
+            let whole = shift_px.round();
+            self.key.move_on(whole as isize);
+            shift_px -= whole;
+            (self.shift_px, self.key_age_s, self.seen) = (Some(shift_px), 0.0, None);
+        }
+        self.key.add(self.level, &self.current, shift_px);
     }
 
     /// Belt texture of the zone: the view minus the background, where it is belt.
@@ -402,195 +449,5 @@ impl Odometry {
                 out[columns.end - blocks.start..].fill(NO_TEXTURE);
             }
         });
-    }
-
-    /// The best match: near the prediction when locked on a moving belt, else over every speed
-    /// from standstill to the fastest allowed, else over all that the zone can show. What does not
-    /// move with the belt (light, dirt on the lens, exposure) correlates at standstill, so motion
-    /// wins over standstill wherever it is seen at all.
-    fn search(&mut self, last_px: f64, dt_s: f64) -> Option<Match> {
-        self.knowledge = Knowledge::NoTexture;
-        if last_px.abs() > self.shift_max_px() || !self.bridges(dt_s) {
-            return None;
-        }
-        let px = |mm_per_s: f64| mm_per_s * dt_s / self.mm_per_px;
-        let slow = px(SLOW * self.expected.nominal_mm_per_s);
-        let predicted = last_px + px(self.speed_mm_per_s);
-        if self.locked && self.speed_mm_per_s.abs() > SLOW * self.expected.nominal_mm_per_s {
-            let near = self.best(predicted - LOCKED_SEARCH_PX, predicted + LOCKED_SEARCH_PX);
-            // A faint one may be one of several, every time.
-            if near.as_ref().is_some_and(|m| m.rho >= MATCH_MIN) {
-                return near;
-            }
-        }
-        let fastest =
-            px(self.expected.nominal_mm_per_s) * (1.0 + self.expected.speed_error_max) + 2.0;
-        let moving = self.best(last_px + slow, last_px + fastest);
-        let is_clear = |m: &Match| m.rho >= MATCH_MIN;
-        let found = if moving.as_ref().is_some_and(is_clear) {
-            moving
-        } else {
-            let still = self.best(last_px - 2.0, last_px + slow + 1.0);
-            still.filter(|m| is_clear(m) && m.texture_grey >= STANDSTILL_GREY_MIN).or(moving)
-        };
-        let (from, to) = (last_px - fastest, last_px + fastest);
-        // A few rows are too few to show its rivals.
-        let every = self.scout_every() as u32;
-        let is_faint = found.as_ref().is_some_and(|m| {
-            f64::from(LIKE_HEIGHT) * m.rho < chance(m.pairs / every).max(MATCH_MIN)
-        });
-        let peaks = if is_faint { self.faint_peaks(from, to) } else { self.peaks(from, to, None) };
-        match (found, peaks) {
-            (Some(found), peaks) if !peaks.rival_of(found.shift_px) => Some(found),
-            (Some(_), _) => {
-                self.knowledge = Knowledge::Ambiguous;
-                None
-            }
-            (None, _) => self.look_far(last_px, dt_s),
-        }
-    }
-
-    /// Frames missing before this one, when its step is a whole multiple of what the locked speed makes
-    /// of its time: no belt doubles its speed from one frame to the next.
-    fn missing(&self, step_px: f64, dt_s: f64) -> u32 {
-        let usual_px = self.speed_mm_per_s * dt_s / self.mm_per_px;
-        let moves = self.speed_mm_per_s.abs() > SLOW * self.expected.nominal_mm_per_s;
-        let times = (step_px / usual_px).round();
-        // A shift is known to a px.
-        let whole = (step_px - times * usual_px).abs() < SCOUT_AGREE * step_px.abs() + 1.0;
-        if self.locked && moves && whole && times >= 2.0 { times as u32 - 1 } else { 0 }
-    }
-
-    /// A speed far from the nominal one, in either direction, that several frames on end show, or the
-    /// usual one over missing frames.
-    fn look_far(&mut self, last_px: f64, dt_s: f64) -> Option<Match> {
-        let most = self.shift_max_px();
-        // What stands still in the picture is no motion.
-        let peaks = self.peaks(-most, most, Some(0));
-        let Some((shift, _)) = peaks.first.filter(|_| dt_s > 0.0) else {
-            self.seen = None;
-            return None;
-        };
-        if peaks.rival_of(shift as f64) {
-            self.knowledge = Knowledge::Ambiguous;
-            self.seen = None;
-            return None;
-        }
-        let missing = self.missing(shift as f64 - last_px, dt_s);
-        if missing > 0 {
-            let found = self.best(shift as f64 - 2.0, shift as f64 + 2.0)?;
-            return Some(Match { missing, ..found });
-        }
-        let speed = shift as f64 * self.mm_per_px / self.key_age_s;
-        let agreed = match self.seen {
-            // A shift is known to a px.
-            Some((before, frames))
-                if (speed - before).abs()
-                    < SCOUT_AGREE * speed.abs() + 2.0 * self.mm_per_px / self.key_age_s =>
-            {
-                frames + 1
-            }
-            _ => 1,
-        };
-        self.seen = Some((speed, agreed));
-        if agreed < SCOUT_FRAMES {
-            return None;
-        }
-        let found = self.best(shift as f64 - 2.0, shift as f64 + 2.0)?;
-        self.speed_mm_per_s = found.shift_px * self.mm_per_px / self.key_age_s;
-        // The step of this frame alone: those before it were assumed.
-        self.shift_px = Some(found.shift_px - self.speed_mm_per_s * dt_s / self.mm_per_px);
-        Some(found)
-    }
-
-    /// Of so many rows one is searched over every speed.
-    fn scout_every(&self) -> usize {
-        (self.key.len() / SCOUT_PX).max(1)
-    }
-
-    /// Peaks of the correlation on a few rows, over a range of shifts, but for those near `without`.
-    fn peaks(&mut self, from: f64, to: f64, without: Option<isize>) -> Peaks {
-        let most = self.shift_max_px();
-        let (from, to) = (from.max(-most).floor() as isize, to.min(most).ceil() as isize);
-        let n = Self::blocks(&self.columns).len();
-        let every = self.scout_every();
-        let rows = self.key.chunks_exact(n).zip(self.current.chunks_exact(n));
-        for (shift, out) in (from..=to).zip(&mut *self.scout) {
-            let mut sums = Sums::default();
-            for (key, current) in rows.clone().step_by(every) {
-                correlate(self.level, key, current, shift, &mut sums);
-            }
-            let c = Correlation::of(&sums);
-            *out = if c.rho > chance(c.pairs).max(MATCH_MIN) { c.rho as f32 } else { 0.0 };
-        }
-        let count = ((to - from + 1).max(0) as usize).min(self.scout.len());
-        Peaks::of(&self.scout[..count], from, without)
-    }
-
-    /// The same on all rows, down to half of what a match needs.
-    fn faint_peaks(&mut self, from: f64, to: f64) -> Peaks {
-        let most = self.shift_max_px();
-        let (from, to) = (from.max(-most).floor() as isize, to.min(most).ceil() as isize);
-        let count = ((to - from + 1).max(0) as usize).min(self.scout.len());
-        for first in (0..count).step_by(PEAK_SHIFTS) {
-            let correlations = self.correlations(from + first as isize);
-            for (out, c) in self.scout[first..count].iter_mut().zip(correlations) {
-                let shows = c.pairs >= PAIRS_MIN && c.rho > 0.5 * match_min(c.pairs);
-                *out = if shows { c.rho as f32 } else { 0.0 };
-            }
-        }
-        Peaks::of(&self.scout[..count], from, None)
-    }
-
-    /// The best interior shift of a range, to a hundredth of a pixel.
-    fn best(&self, from: f64, to: f64) -> Option<Match> {
-        let (from, to) = (from.floor() as isize, to.ceil() as isize);
-        // The peak is most often in the middle of a short range: then its surroundings are known.
-        let start = from.min(from.midpoint(to) - PEAK_HALF);
-        let mut best: Option<(isize, Correlation)> = None;
-        let mut known = (start, self.correlations(start));
-        for first in (start..=to).step_by(PEAK_SHIFTS) {
-            if first != known.0 {
-                known = (first, self.correlations(first));
-            }
-            for (shift, c) in (first..=to).zip(known.1) {
-                let better = c.pairs >= PAIRS_MIN && best.is_none_or(|(_, b)| c.rho > b.rho);
-                if shift >= from && better {
-                    best = Some((shift, c));
-                }
-            }
-        }
-        let (shift, c) = best?;
-        // A maximum at the end of the range is a slope, not a match.
-        if c.rho < match_min(c.pairs) || shift == from || shift == to {
-            return None;
-        }
-        if shift - PEAK_HALF != known.0 {
-            known.1 = self.correlations(shift - PEAK_HALF);
-        }
-        let around = known.1.map(|c| c.rho);
-        let texture_grey = self.unit_grey * c.covariance.max(0.0).sqrt();
-        let shift_px = shift as f64 + peak(&around)?;
-        Some(Match { shift_px, rho: c.rho, pairs: c.pairs, texture_grey, missing: 0 })
-    }
-
-    /// Normalised correlation of key and current texture, and the pixels that took part, the belt
-    /// having moved by `first` px, `first + 1` and so on.
-    fn correlations(&self, first: isize) -> [Correlation; PEAK_SHIFTS] {
-        let n = Self::blocks(&self.columns).len();
-        let part = rows_per_band(self.key.len() / n, self.bands) * n;
-        let parts = self.key.chunks(part).zip(self.current.chunks(part));
-        let mut jobs: Jobs<_> = parts.map(|part| (part, [Sums::default(); PEAK_SHIFTS])).collect();
-        bands::run(&mut jobs, &|((key, current), sums)| {
-            for (key, current) in key.chunks_exact(n).zip(current.chunks_exact(n)) {
-                for (shift, sums) in (first..).zip(&mut *sums) {
-                    correlate(self.level, key, current, shift, sums);
-                }
-            }
-        });
-        std::array::from_fn(|k| {
-            let sums = jobs.iter().fold(Sums::default(), |all, (_, more)| all.plus(&more[k]));
-            Correlation::of(&sums)
-        })
     }
 }

@@ -46,7 +46,7 @@ pub struct Track {
 pub(super) const FREE: Track = Track {
     phase: Phase::Free,
     bounds: PxBox { u0: 0.0, u1: 0.0, v0: 0.0, v1: 0.0 },
-    first: BeltPosition { travel_mm: 0.0, measured_mm: 0.0, breaks: 0 },
+    first: BeltPosition { travel_mm: 0.0, measured_mm: 0.0, coded_mm: 0.0, breaks: 0 },
     frames: 0,
     merged: false,
     merged_frames: 0,
