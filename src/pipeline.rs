@@ -286,7 +286,7 @@ impl Pipeline {
         self.reporting = reporting;
     }
 
-    /// The input has ended: report what is still inside, flagged unfinished.
+    /// The input has ended: report what is still inside and had a shape, flagged unfinished.
     pub fn finish(&mut self, emit: &mut dyn FnMut(ParcelRecord)) {
         let Self { passes, leaving, .. } = self;
         passes.finish(&mut |passed| leaving.add_pass(passed));

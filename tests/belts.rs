@@ -1,6 +1,8 @@
 //! Belts as they are: woven, plain, seen by a noisy camera. What passes on them is told, once.
 
 mod common;
+#[path = "belts/ribs.rs"]
+mod ribs;
 
 use beltgauge::config::{Config, Site};
 use beltgauge::event::{Flags, NotMeasured, ParcelRecord};
@@ -119,69 +121,6 @@ fn a_plain_belt_frozen_by_compression_does_not_stand() {
     assert_honest(&records, 3);
 }
 
-/// Draws ribs across the belt that ride on it: their height in grey levels, `period_mm` apart.
-fn ribs(frame: &mut [u8], grey: f64, [rib_grey, period_mm]: [f64; 2], travel_mm: f64) {
-    for row in frame.chunks_exact_mut(640) {
-        for (u, pixel) in row.iter_mut().enumerate() {
-            let x_mm = (u as f64 - 319.5) * 1000.0 / 512.0 - travel_mm;
-            let rib = rib_grey * (std::f64::consts::TAU * x_mm / period_mm).sin();
-            if (f64::from(*pixel) - grey).abs() < 9.0 {
-                *pixel = (f64::from(*pixel) + rib) as u8;
-            }
-        }
-    }
-}
-
-#[test]
-fn boxes_on_a_belt_with_ribs_are_measured() {
-    for period_mm in [7.0, 18.5, 30.0, 60.0] {
-        let scenario = boxes(2, 60.0, 0.0, "");
-        // As wrong as a nameplate is.
-        let site = site(&scenario, 490.0);
-        let (records, pipeline) = run(&scenario, site, |_, frame, time| {
-            ribs(frame, 60.0, [5.0, period_mm], scenario.travel_at_frame_mm(time.index));
-        });
-        let all_right = records.iter().all(|r| is_right(r) && r.may_be_used);
-        assert!(records.len() == 2 && all_right, "{period_mm} mm: {records:#?}");
-        assert_eq!(pipeline.health().texture, Knowledge::Measured, "{period_mm} mm");
-    }
-}
-
-#[test]
-fn a_belt_with_ribs_is_never_silently_wrong_when_it_stops() {
-    for stop in ["at_s = 3.2\nfor_s = 1.0\nramp_s = 0.2", "at_s = 3.0\nfor_s = 2.0\nramp_s = 0.05"]
-    {
-        for period_mm in [7.0, 18.5, 30.0, 60.0] {
-            let mut scenario = boxes(2, 60.0, 0.0, &format!("[[belt.stop]]\n{stop}\n"));
-            scenario.frames += 70;
-            let (records, _) = run(&scenario, site(&scenario, 500.0), |_, frame, time| {
-                ribs(frame, 60.0, [5.0, period_mm], scenario.travel_at_frame_mm(time.index));
-            });
-            eprintln!("{period_mm} mm, {stop:?}");
-            assert_honest(&records, 2);
-        }
-    }
-}
-
-/// The ribs look the same when the belt moves by one of them more, or less, from frame to frame; so fast it is configured.
-#[test]
-fn ribs_that_seem_to_move_at_a_wrong_nominal_speed_are_refuted_by_what_lies_on_them() {
-    for height_mm in [80.0, 10.0] {
-        for (period_mm, nominal_mm_per_s) in [(7.0, 290.0), (7.0, 710.0), (18.5, 1055.0)] {
-            let scenario = belt(&[([200.0, 120.0, height_mm], 8.0); 2], 60.0, 0.0, "");
-            let site = site(&scenario, nominal_mm_per_s);
-            let (records, _) = run(&scenario, site, |_, frame, time| {
-                ribs(frame, 60.0, [5.0, period_mm], scenario.travel_at_frame_mm(time.index));
-            });
-            for record in &records {
-                let off_mm = (record.height_mm - height_mm).abs();
-                let honest = off_mm < 3.0 || !record.may_be_used;
-                assert!(honest, "{period_mm} mm at {nominal_mm_per_s} mm/s: {record:#?}");
-            }
-        }
-    }
-}
-
 const NOISY: &str = "[noise]\nread_grey = 5.0\n";
 /// Five times the texture: its correlation is below what a single search takes for clear.
 const VERY_NOISY: &str = "[noise]\nread_grey = 7.0\n";
@@ -213,24 +152,6 @@ fn boxes_on_a_texture_far_below_the_camera_s_noise_are_measured() {
     let records = measure_scenario(&scenario, site(&scenario, 490.0));
     let is_well = |r: &ParcelRecord| is_right(r) && r.may_be_used;
     assert!(records.len() == 3 && records.iter().all(is_well), "{records:#?}");
-}
-
-#[test]
-fn faint_ribs_under_a_noisy_camera_give_the_right_speed_or_none() {
-    for period_mm in [7.0, 18.5, 30.0] {
-        let scenario = boxes(1, 60.0, 0.0, NOISY);
-        let mut measured = 0;
-        let (records, _) = run(&scenario, site(&scenario, 490.0), |pipeline, frame, time| {
-            let (speed_mm_per_s, is_measured) = pipeline.belt_motion();
-            measured += u32::from(is_measured);
-            let off = (speed_mm_per_s / SPEED_MM_PER_S - 1.0).abs();
-            // Found beginning from the nominal one, which is off by 0.02.
-            assert!(off < 0.021 || !is_measured, "{period_mm} mm: {speed_mm_per_s}");
-            ribs(frame, 60.0, [2.0, period_mm], scenario.travel_at_frame_mm(time.index));
-        });
-        eprintln!("{period_mm} mm: {measured} frames");
-        assert_honest(&records, 1);
-    }
 }
 
 #[test]

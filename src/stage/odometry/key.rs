@@ -49,6 +49,11 @@ impl Key {
         &self.texture
     }
 
+    /// Whether the texture is that of several frames.
+    pub fn is_mean(&self) -> bool {
+        self.is_mean
+    }
+
     /// The current frame is the key from here on; `current` is what was the key.
     pub fn replace(&mut self, current: &mut Block<i8>) {
         std::mem::swap(&mut self.texture, current);

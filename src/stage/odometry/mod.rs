@@ -145,8 +145,10 @@ pub struct Odometry {
     seen: Option<(f64, u32)>,
     knowledge: Knowledge,
     locked: bool,
-    /// Correlation of the last match.
+    /// Correlation of the last match, as of two single frames.
     rho: f64,
+    /// Frames in which a texture that repeats itself moved neither as configured nor stood.
+    unusual_frames: u32,
     /// Frames without a match since the last one.
     misses: u32,
     /// Frames that were missing though the time stamps did not tell.
@@ -225,6 +227,7 @@ impl Odometry {
             knowledge: Knowledge::default(),
             locked: false,
             rho: 0.0,
+            unusual_frames: 0,
             misses: 0,
             untold_gaps: 0,
             proofs: 0,
@@ -271,7 +274,8 @@ impl Odometry {
                 self.speed_mm_per_s += SPEED_FOLLOW * (self.last_mm_per_s - self.speed_mm_per_s);
             }
             self.knowledge = Knowledge::Measured;
-            self.rho = m.rho;
+            // Of a mean, next to noiseless, and a frame the correlation is the root.
+            self.rho = if self.key.is_mean() { m.rho * m.rho } else { m.rho };
             self.misses = 0;
             self.shift_px = Some(m.shift_px);
             self.renew_key(&m);
@@ -284,6 +288,11 @@ impl Odometry {
                 self.speed_mm_per_s = self.expected.nominal_mm_per_s;
                 self.take_key();
                 self.misses = 0;
+            } else if self.knowledge == Knowledge::Ambiguous {
+                // Each step is looked at alone: no assumed one comes in.
+                let seen = self.seen;
+                self.take_key();
+                self.seen = seen;
             }
         }
         Motion { step_mm, measured: self.locked }
@@ -327,7 +336,8 @@ impl Odometry {
         };
         let as_expected = (speed_mm_per_s / self.expected.nominal_mm_per_s - 1.0).abs()
             < self.expected.speed_error_max;
-        if (agrees || as_expected) && !contradicts && pairs >= PROOF_PAIRS {
+        // A texture that repeats itself moves as expected because that was expected.
+        if (agrees || as_expected) && !contradicts && pairs >= PROOF_PAIRS && !self.repeats {
             self.proofs += 1;
         }
         if agrees {
@@ -340,7 +350,7 @@ impl Odometry {
         let refuted = contradicts && !is_proven;
         if refuted {
             self.knowledge = Knowledge::Refuted;
-            self.proofs = 0;
+            (self.proofs, self.seen) = (0, None);
         }
         refuted
     }
@@ -348,6 +358,7 @@ impl Odometry {
     /// The next frame follows no other: as at start, but for the speed.
     pub fn forget(&mut self) {
         (self.shift_px, self.seen, self.locked, self.misses) = (None, None, false, 0);
+        self.repeats = false;
     }
 
     /// Shifts in px beyond which the zone does not show the motion.
@@ -409,7 +420,7 @@ impl Odometry {
             || found.pairs < PAIRS_MIN * 2;
         // What a codec leaves of the texture sticks to the picture's blocks: a mean would follow them.
         let is_averaged =
-            found.rho < NOISY && found.texture_grey >= TEXTURE_GREY_MIN && !self.blocks.are_seen();
+            self.rho < NOISY && found.texture_grey >= TEXTURE_GREY_MIN && !self.blocks.are_seen();
         if !is_averaged {
             if is_far {
                 self.take_key();

@@ -5,15 +5,19 @@
 
 use super::correlation::{Correlation, MATCH_MIN, Match, chance, match_min};
 use super::peaks::{LIKE_HEIGHT, PEAK_HALF, PEAK_SHIFTS, Peaks, peak};
-use super::{Knowledge, Odometry, PAIRS_MIN, SLOW, TEXTURE_GREY_MIN};
+use super::{Knowledge, Odometry, PAIRS_MIN, SLOW, STILL, TEXTURE_GREY_MIN};
 use crate::kernel::bands::{self, Jobs, rows_per_band};
 use crate::kernel::scalar::texture::Sums;
 use crate::kernel::simd::texture::correlate;
 
-/// A shift is known to this, px.
-const SHIFT_ERROR_PX: f64 = 1.0;
-/// Faster no belt is braked or started: an emergency stop from 1 m/s takes 0.2 s.
-const ACCELERATION_MAX_MM_PER_S2: f64 = 5000.0;
+/// The step of a texture that repeats itself is known to this, px: it is a clear one.
+const STEP_ERROR_PX: f64 = 0.5;
+/// Steps of a belt that neither brakes nor starts differ by no more than this, px.
+const STEADY_PX: f64 = 0.25;
+/// Faster no belt is braked or started, but in an emergency: from 1 m/s in half a second.
+const ACCELERATION_MAX_MM_PER_S2: f64 = 2000.0;
+/// A belt brakes, or starts, within so many frames; what moves otherwise for longer is another of its texture's speeds.
+const UNUSUAL_FRAMES_MAX: u32 = 60;
 /// When locked, shifts this far around the prediction are tried.
 const LOCKED_SEARCH_PX: f64 = 1.5;
 /// Pixels of the rows that are searched over every speed.
@@ -36,6 +40,10 @@ impl Odometry {
         let px = |mm_per_s: f64| mm_per_s * dt_s / self.mm_per_px;
         let slow = px(SLOW * self.expected.nominal_mm_per_s);
         let predicted = last_px + px(self.speed_mm_per_s);
+        if self.locked && self.repeats {
+            self.knowledge = Knowledge::Ambiguous;
+            return self.look_near(last_px, dt_s);
+        }
         if self.locked && self.speed_mm_per_s.abs() > SLOW * self.expected.nominal_mm_per_s {
             let near = self.best(predicted - LOCKED_SEARCH_PX, predicted + LOCKED_SEARCH_PX);
             // A faint one may be one of several, every time.
@@ -102,19 +110,41 @@ impl Odometry {
         let missing = self.missing(shift as f64 - last_px, dt_s);
         if missing > 0 {
             let found = self.best(shift as f64 - 2.0, shift as f64 + 2.0)?;
+            self.repeats = false;
             return Some(Match { missing, ..found });
         }
-        if !self.is_agreed(shift as f64) {
+        let speed = shift as f64 * self.mm_per_px / self.key_age_s;
+        // A shift is known to a px.
+        let off = SCOUT_AGREE * speed.abs() + 2.0 * self.mm_per_px / self.key_age_s;
+        if !self.is_agreed(speed, off) {
             return None;
         }
         let found = self.best(shift as f64 - 2.0, shift as f64 + 2.0)?;
-        self.correct_assumed_steps(&found, dt_s);
+        self.repeats = false;
+        self.speed_mm_per_s = found.shift_px * self.mm_per_px / self.key_age_s;
+        // The step of this frame alone: those before it were assumed.
+        self.shift_px = Some(found.shift_px - self.speed_mm_per_s * dt_s / self.mm_per_px);
         Some(found)
     }
 
     /// Of a texture that fits itself at several shifts, the only one that a belt's masses allow after the last step; or, when that
-    /// is not known, the only one at the configured speed, once several frames on end show it.
+    /// is not known, the only one at the configured speed, once several frames on end show the same step.
     fn look_near(&mut self, last_px: f64, dt_s: f64) -> Option<Match> {
+        let found = self.only_one_near(last_px, dt_s);
+        if self.locked {
+            return found.filter(|found| self.may_go_on(found.shift_px - last_px, dt_s));
+        }
+        let Some(found) = found else {
+            self.seen = None;
+            return None;
+        };
+        let px_per_s = (found.shift_px - last_px) / dt_s;
+        let off_px_per_s = STEADY_PX / dt_s;
+        self.repeats = self.is_agreed(px_per_s * self.mm_per_px, off_px_per_s * self.mm_per_px);
+        self.repeats.then_some(found)
+    }
+
+    fn only_one_near(&mut self, last_px: f64, dt_s: f64) -> Option<Match> {
         let nominal_mm_per_s = self.expected.nominal_mm_per_s;
         let (usual_mm_per_s, off_mm_per_s) = if self.locked {
             (self.last_mm_per_s, ACCELERATION_MAX_MM_PER_S2 * dt_s)
@@ -123,58 +153,45 @@ impl Odometry {
         };
         let [usual_px, off_px] =
             [usual_mm_per_s, off_mm_per_s].map(|speed| speed * dt_s / self.mm_per_px);
-        let reach_px = off_px + SHIFT_ERROR_PX;
-        let [from, to] = [-reach_px, reach_px].map(|px| last_px + usual_px + px);
-        let found = self.best(from, to).filter(|found| self.is_alone(found, from, to))?;
-        if !self.locked {
-            if !self.is_agreed(found.shift_px) {
-                return None;
-            }
-            self.correct_assumed_steps(&found, dt_s);
-        }
-        self.repeats = true;
-        Some(found)
+        let most = self.shift_max_px();
+        let [from, to] = [-1.0, 1.0]
+            .map(|side| (last_px + usual_px + side * (off_px + STEP_ERROR_PX)).clamp(-most, most));
+        let in_range = |m: &Match| dt_s > 0.0 && (from..=to).contains(&m.shift_px);
+        let found = self.best(from, to).filter(in_range)?;
+        self.is_alone(&found, from, to).then_some(found)
+    }
+
+    /// Whether a texture that repeats itself may go on so: for long it moves at the configured speed, or stands.
+    fn may_go_on(&mut self, step_px: f64, dt_s: f64) -> bool {
+        let speed_mm_per_s = step_px * self.mm_per_px / dt_s;
+        let nominal_mm_per_s = self.expected.nominal_mm_per_s;
+        let off = (speed_mm_per_s / nominal_mm_per_s - 1.0).abs();
+        let is_usual = off < self.expected.speed_error_max + STEP_ERROR_PX / step_px.abs().max(1.0)
+            || speed_mm_per_s.abs() < STILL * nominal_mm_per_s;
+        self.unusual_frames = if is_usual { 0 } else { self.unusual_frames + 1 };
+        self.unusual_frames < UNUSUAL_FRAMES_MAX
     }
 
     /// Whether a match has no rival within a range, however near.
     fn is_alone(&mut self, found: &Match, from: f64, to: f64) -> bool {
         let (from, to) = (from.floor() as isize - 1, to.ceil() as isize + 1);
-        let count = ((to - from + 1) as usize).min(self.scout.len());
-        for first in (0..count).step_by(PEAK_SHIFTS) {
-            let correlations = self.correlations(from + first as isize);
-            for (out, c) in self.scout[first..count].iter_mut().zip(correlations) {
-                *out = c.rho as f32;
-            }
-        }
+        let count = self.correlate_all(from, to, |c| c.pairs >= PAIRS_MIN);
         let like = LIKE_HEIGHT * found.rho as f32;
-        let rivals = (from + 1..to).zip(self.scout[..count].windows(3)).filter(|(shift, rho)| {
-            let is_peak = rho[1] >= rho[0] && rho[1] >= rho[2];
-            is_peak && rho[1] > like && (*shift as f64 - found.shift_px).abs() > 1.0
-        });
-        rivals.count() == 0
+        let mut peaks = (from + 1..to).zip(self.scout[..count].windows(3));
+        peaks.all(|(shift, rho)| {
+            let is_peak = rho[1] >= rho[0] && rho[1] >= rho[2] && rho[1] > like;
+            !is_peak || (shift as f64 - found.shift_px).abs() <= 1.0
+        })
     }
 
-    /// Whether enough frames on end have shown the speed that the key's shift shows.
-    fn is_agreed(&mut self, shift_px: f64) -> bool {
-        let speed = shift_px * self.mm_per_px / self.key_age_s;
+    /// Whether enough frames on end have shown a speed, mm/s, that differs by no more than `off`.
+    fn is_agreed(&mut self, speed: f64, off: f64) -> bool {
         let agreed = match self.seen {
-            // A shift is known to a px.
-            Some((before, frames))
-                if (speed - before).abs()
-                    < SCOUT_AGREE * speed.abs() + 2.0 * self.mm_per_px / self.key_age_s =>
-            {
-                frames + 1
-            }
+            Some((before, frames)) if (speed - before).abs() < off => frames + 1,
             _ => 1,
         };
         self.seen = Some((speed, agreed));
         agreed >= SCOUT_FRAMES
-    }
-
-    /// The step of this frame alone is what it shows: those before it were assumed.
-    fn correct_assumed_steps(&mut self, found: &Match, dt_s: f64) {
-        self.speed_mm_per_s = found.shift_px * self.mm_per_px / self.key_age_s;
-        self.shift_px = Some(found.shift_px - self.speed_mm_per_s * dt_s / self.mm_per_px);
     }
 
     /// Of so many rows one is searched over every speed.
@@ -205,15 +222,26 @@ impl Odometry {
     fn faint_peaks(&mut self, from: f64, to: f64) -> Peaks {
         let most = self.shift_max_px();
         let (from, to) = (from.max(-most).floor() as isize, to.min(most).ceil() as isize);
+        let shows = |c: &Correlation| c.pairs >= PAIRS_MIN && c.rho > 0.5 * match_min(c.pairs);
+        let count = self.correlate_all(from, to, shows);
+        Peaks::of(&self.scout[..count], from, None)
+    }
+
+    /// Correlations on all rows over a range of shifts, 0 where they do not show anything. Returns how many.
+    fn correlate_all(
+        &mut self,
+        from: isize,
+        to: isize,
+        shows: impl Fn(&Correlation) -> bool,
+    ) -> usize {
         let count = ((to - from + 1).max(0) as usize).min(self.scout.len());
         for first in (0..count).step_by(PEAK_SHIFTS) {
             let correlations = self.correlations(from + first as isize);
             for (out, c) in self.scout[first..count].iter_mut().zip(correlations) {
-                let shows = c.pairs >= PAIRS_MIN && c.rho > 0.5 * match_min(c.pairs);
-                *out = if shows { c.rho as f32 } else { 0.0 };
+                *out = if shows(&c) { c.rho as f32 } else { 0.0 };
             }
         }
-        Peaks::of(&self.scout[..count], from, None)
+        count
     }
 
     /// The best interior shift of a range, to a hundredth of a pixel.
