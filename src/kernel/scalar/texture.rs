@@ -105,7 +105,7 @@ impl Sums {
     }
 }
 
-/// The pixels of a key row and a current row, so long, that lie on each other when the current one has moved by `shift`.
+/// The pixels of a key row and a current row, of these lengths, that lie on each other when the current one has moved by `shift`.
 pub fn overlap_range(key: usize, current: usize, shift: isize) -> (Range<usize>, Range<usize>) {
     let first = shift.unsigned_abs();
     let (from, to) = if shift < 0 { (first.min(key), 0) } else { (0, first.min(current)) };

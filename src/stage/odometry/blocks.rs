@@ -8,16 +8,17 @@ use crate::image::Plane;
 
 /// Side of a block, px.
 const SIDE_PX: usize = 8;
-/// Of so many rows one is looked at, another in each frame.
+/// Of so many rows one is looked at, another in each frame: a codec shows in all of them, and all of them cost time.
 const EVERY_ROW: usize = 64;
 /// Larger steps than this are edges of things, grey levels.
 const STEP_MAX: u8 = 8;
-/// Steps from block to block are so many times larger: 1.0 to 1.15 without a codec, from 1.5 with one.
+/// Steps from block to block are so many times larger. Seen: 1.0 to 1.15 without a codec, 1.5 to 10 with JPEG of quality 92 to
+/// 30; H.264 at its default reaches 1.3 on a belt of strong texture, where little is lost, and 2.3 elsewhere.
 const STEP_RATIO: f32 = 1.3;
-/// How fast the means follow, a frame.
+/// How fast the sums are followed, a frame: half of them are those of the last 14.
 const FOLLOW: f32 = 0.05;
 
-/// Means of the steps from one pixel to the next, for each place in a block.
+/// Sums of the steps from one pixel to the next, for each place in a block, followed.
 #[derive(Default)]
 pub struct Blocks {
     steps: [f32; SIDE_PX],

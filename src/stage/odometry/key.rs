@@ -1,8 +1,8 @@
 //! The texture that the current frame's is matched with.
 //!
-//! In: the texture of frames whose shift is known. Out: that of the belt in the zone, as the first frame showed it that saw it,
-//! or, where noise is stronger than the texture, the mean of the first few: noise differs from frame to frame, the texture
-//! rides along. What the key knows stays as it is while the belt moves on, so that errors of matches do not add
+//! In: the texture of frames whose shift is known. Out: that of the belt in the zone, as one frame showed it,
+//! or, where noise is stronger than the texture, the mean of the first frames that saw each pixel: noise differs from frame to
+//! frame, the texture rides along. What the key knows stays as it is while the belt moves on, so that errors of matches do not add
 //! up. Owns both.
 
 use crate::error::Result;

@@ -345,7 +345,6 @@ impl Odometry {
         }
         self.doubts.0 += u32::from(contradicts && !self.doubts.1);
         self.doubts.1 = contradicts;
-        // A texture that repeats itself was seen to move as expected because that was expected.
         let is_proven = !self.repeats && self.proofs >= PROOF_FRAMES && self.doubts.0 < DOUBTS_MAX;
         let refuted = contradicts && !is_proven;
         if refuted {
