@@ -15,7 +15,8 @@ mosquitto_sub -V 5 -h "$broker" -i bridge -c -x 86400 -q 1 "$@" \
     while IFS= read -r line; do
         batch=$line$'\n'
         for _ in {2..500}; do
-            IFS= read -r -t 1 line || break
+            # A line may come in parts.
+            IFS= read -r -t 1 line || { [ -n "$line" ] || break; IFS= read -r rest || true; line+=$rest; }
             batch+=$line$'\n'
         done
         until printf %s "$batch" | insert; do sleep 5; done

@@ -27,23 +27,33 @@ pub fn project() -> PathBuf {
     Path::new(env!("CARGO_MANIFEST_DIR")).join("..")
 }
 
-/// Build the optimised binary, if need be, and return its path.
+/// The triple that is tested: this machine's own.
+const TARGET: &str = if cfg!(target_arch = "aarch64") {
+    "aarch64-unknown-linux-gnu"
+} else {
+    "x86_64-unknown-linux-gnu"
+};
+
+/// Build the appliance, if need be, as `board/build` does for the image (optimised and static), and
+/// return its path.
 ///
 /// # Panics
 /// When it does not build: then no test makes sense.
 pub fn beltgauge() -> PathBuf {
-    let output = Command::new(env!("CARGO"))
-        .args(["build", "--release", "--package", "beltgauge", "--message-format", "json"])
+    static_binary("beltgauge", &["--package", "beltgauge"])
+}
+
+/// Build a static program and return its path.
+fn static_binary(name: &str, arguments: &[&str]) -> PathBuf {
+    let status = Command::new(env!("CARGO"))
+        .args(["build", "--release", "--locked", "--target", TARGET])
+        .args(arguments)
+        .env("RUSTFLAGS", "-C target-feature=+crt-static")
         .current_dir(project())
-        .stderr(Stdio::inherit())
-        .output()
+        .status()
         .expect("cargo runs");
-    assert!(output.status.success(), "the binary does not build");
-    String::from_utf8_lossy(&output.stdout)
-        .lines()
-        .filter_map(|line| serde_json::from_str::<serde_json::Value>(line).ok())
-        .find_map(|message| message["executable"].as_str().map(PathBuf::from))
-        .expect("cargo names the executable")
+    assert!(status.success(), "{name} does not build");
+    project().join("target").join(TARGET).join("release").join(name)
 }
 
 /// A demo that runs until it is dropped or has ended.

@@ -7,9 +7,6 @@ use std::ops::{Deref, DerefMut};
 use std::path::{Path, PathBuf};
 use std::process::Command;
 
-/// The triple that the static binaries are built for.
-const TARGET: &str = "x86_64-unknown-linux-gnu";
-
 /// A running machine; dropped, it is switched off.
 pub struct Machine {
     shell: Shell,
@@ -17,22 +14,10 @@ pub struct Machine {
     pub modbus: SocketAddr,
 }
 
-/// Build the appliance and the programs of this package statically; returns their paths.
-fn static_binaries() -> [PathBuf; 2] {
-    let build = |arguments: &[&str]| {
-        let status = Command::new(env!("CARGO"))
-            .args(["build", "--release", "--target", TARGET])
-            .args(arguments)
-            .env("RUSTFLAGS", "-C target-feature=+crt-static")
-            .current_dir(super::project())
-            .status()
-            .expect("cargo runs");
-        assert!(status.success(), "the static binaries do not build");
-    };
-    build(&["--package", "beltgauge"]);
-    build(&["--package", "hil", "--no-default-features", "--bin", "can_bench"]);
-    let folder = super::project().join("target").join(TARGET).join("release");
-    ["beltgauge", "can_bench"].map(|name| folder.join(name))
+/// The appliance and its peer on the CAN bus.
+fn binaries() -> [PathBuf; 2] {
+    let peer = ["--package", "hil", "--no-default-features", "--bin", "can_bench"];
+    [crate::beltgauge(), crate::static_binary("can_bench", &peer)]
 }
 
 impl Machine {
@@ -44,7 +29,7 @@ impl Machine {
         let out = super::project().join("target/hil-out/machine");
         let made = Command::new(super::project().join("hil/machine/make"))
             .arg(&out)
-            .args(static_binaries())
+            .args(binaries())
             .status()
             .expect("hil/machine/make is there");
         assert!(made.success(), "the initramfs cannot be made");
