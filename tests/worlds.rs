@@ -35,13 +35,13 @@ const WORLDS: usize = 1;
 /// The first only rises, the second only falls.
 const REACHED: [(f64, usize); Class::ALL.len()] = [
     (1.0, 0),
-    (0.8, 1),
-    (0.6, 2),
+    (1.0, 0),
+    (0.8, 0),
     (0.875, 0),
     (0.6, 0),
     (0.4, 0),
     (0.6, 0),
-    (0.6, 1),
+    (0.8, 0),
     (1.0, 0),
     (0.0, 0),
     (0.8, 0),

@@ -11,6 +11,7 @@ use super::model::{
     YAW, canonical, direction,
 };
 use super::observe::{EdgeSample, PassView};
+use super::shadow::DarkEdge;
 use super::votes::{RISING_TRUST, SLOPE_ENOUGH, choose};
 use crate::camera::BeltView;
 use crate::units::BeltRect;
@@ -47,7 +48,7 @@ const REACH_ERROR_HALVES: f64 = 50.0;
 /// Where an enclosing cuboid is larger than what it encloses, that counts this much.
 const INSIDE_WEIGHT: f64 = 0.1;
 /// Profiles on neighbouring places and frames share their errors; this many count as one.
-const CORRELATED_SAMPLES: f64 = 20.0;
+pub(super) const CORRELATED_SAMPLES: f64 = 20.0;
 /// Below this no dimension is trusted, mm: lens model, edge rounding.
 const SIGMA_FLOOR_MM: f64 = 0.3;
 /// The height from edges alone depends twice as much on their rounding, and on shadows.
@@ -155,6 +156,8 @@ struct EdgeUse {
     contrast: f64,
     /// For each edge.
     polarity: Polarity,
+    /// For each edge of the top face.
+    dark: [DarkEdge; EDGES / 2],
 }
 
 impl Estimate {
@@ -281,7 +284,15 @@ impl Problem<'_> {
         } else {
             reach_error.max(1.0)
         };
-        let mut sigma = covariance.diagonal().map(|v| (excess * v.max(0.0)).sqrt());
+        let mut variance = covariance.diagonal().map(|v| excess * v.max(0.0));
+        let step_sigma = excess.sqrt() * edge_sigma;
+        for dark in &used.dark {
+            let shadow_mm = dark.sigma_mm(params[HEIGHT], step_sigma, self.geometry.mm_per_px);
+            let off = covariance * dark.rows() * shadow_mm
+                / (CORRELATED_SAMPLES * edge_sigma * edge_sigma);
+            variance += off.component_mul(&off);
+        }
+        let mut sigma = variance.map(f64::sqrt);
         for i in [X, Y, LENGTH, WIDTH, HEIGHT] {
             sigma[i] = sigma[i].hypot(SIGMA_FLOOR_MM);
         }
@@ -454,12 +465,11 @@ impl Problem<'_> {
                 let share = residual / gate_mm;
                 let biweight = (1.0 - share * share).powi(2);
                 used.contrast += biweight * f64::from(slope.abs().min(SLOPE_ENOUGH)).ln_1p();
-                let trust = trust[e][usize::from(slope > 0.0)];
-                normal.add(
-                    residual,
-                    &row,
-                    trust * biweight / (CORRELATED_SAMPLES * sigma_mm * sigma_mm),
-                );
+                let weight = trust[e][usize::from(slope > 0.0)] * biweight;
+                normal.add(residual, &row, weight / (CORRELATED_SAMPLES * sigma_mm * sigma_mm));
+                if slope > 0.0 && !sample.edge.is_base() {
+                    used.dark[sample.edge.face()].add(residual, &row, weight);
+                }
             }
         }
         used

@@ -13,6 +13,7 @@ mod fit;
 mod model;
 mod observe;
 mod search;
+mod shadow;
 mod votes;
 mod whole_pass;
 
