@@ -84,22 +84,32 @@ mod tests {
         edge.sigma_mm(height_mm, STEP_SIGMA_MM, MM_PER_PX)
     }
 
+    /// Of the edges of a shadow this wide.
+    fn anywhere_in(width_mm: f64) -> f64 {
+        width_mm / 12f64.sqrt()
+    }
+
     #[test]
     fn an_edge_that_moves_with_the_top_face_is_none_of_a_shadow() {
-        assert_eq!(left_open(HEIGHT_MM, [-0.3, 0.3], 0.0), 0.0);
+        assert!(left_open(HEIGHT_MM, [-0.3, 0.3], 0.0).abs() < 1e-9);
     }
 
     #[test]
     fn a_border_that_moves_with_the_belt_leaves_its_shadow_open() {
-        let wide = WIDTH_MAX_PX * MM_PER_PX / 12f64.sqrt();
-        assert_eq!(left_open(HEIGHT_MM, [-0.3, 0.3], HEIGHT_MM), wide);
-        // A low parcel's shadow is narrow, and no motion tells it from the edge.
-        assert_eq!(left_open(2.0, [-0.02, 0.02], 0.0), 2.0 * REACH / 12f64.sqrt());
+        let open = left_open(HEIGHT_MM, [-0.3, 0.3], HEIGHT_MM);
+        assert!((open - anywhere_in(WIDTH_MAX_PX * MM_PER_PX)).abs() < 1e-9, "{open}");
+    }
+
+    #[test]
+    fn a_low_parcel_s_shadow_is_narrow_and_no_motion_tells_it_from_the_edge() {
+        let open = left_open(1.5, [-0.02, 0.02], 0.0);
+        assert!((open - anywhere_in(1.5 * REACH)).abs() < 1e-9, "{open}");
     }
 
     #[test]
     fn an_edge_along_the_belt_moves_with_nothing() {
-        assert!(left_open(HEIGHT_MM, [0.1, 0.1], 0.0) > 0.0);
-        assert_eq!(DarkEdge::default().sigma_mm(HEIGHT_MM, STEP_SIGMA_MM, MM_PER_PX), 0.0);
+        assert!(left_open(HEIGHT_MM, [0.1, 0.1], 0.0) > 0.5);
+        let unseen = DarkEdge::default().sigma_mm(HEIGHT_MM, STEP_SIGMA_MM, MM_PER_PX);
+        assert!(unseen.abs() < 1e-9, "{unseen}");
     }
 }
