@@ -8,6 +8,9 @@ use std::io::Write;
 use std::net::{SocketAddr, TcpStream};
 use std::process::Command;
 
+/// Bit of the fault word: a busy computer leaves frames of the demo out.
+const FRAMES_MISSING: u16 = 1 << 10;
+
 /// Registers as mbpoll prints them; `kind` 4: holding, 3: input.
 fn mbpoll(address: SocketAddr, kind: u32, first: u32, count: u32) -> HashMap<u32, u16> {
     let output = Command::new("mbpoll")
@@ -64,7 +67,8 @@ fn mbpoll_reads_what_was_measured() {
     wait_for_parcels(&demo, 2);
     assert_ne!(mbpoll(demo.address, 4, 10, 1)[&10], beat, "the heartbeat stands still");
     let status = mbpoll(demo.address, 4, 11, 2);
-    assert_eq!((status[&11] & 3, status[&12]), (3, 0), "running and ready, no fault");
+    let fault = status[&12] & !FRAMES_MISSING;
+    assert_eq!((status[&11] & 3, fault), (3, 0), "running and ready, no fault");
     let latest = mbpoll(demo.address, 4, 100, 32);
     assert_eq!(latest[&101], latest[&131]);
     let seq = usize::from(latest[&101]);
@@ -106,8 +110,9 @@ fn pymodbus_reads_what_was_measured() {
     let records = demo.records();
     for block in ring {
         assert_eq!(block["seq"], block["seq_end"]);
-        assert_eq!(block["valid"].as_u64().expect("bits") & 1, 1);
         let record = &records[block["seq"].as_u64().expect("a number") as usize - 1];
+        let may_be_used = block["valid"].as_u64().expect("bits") & 1 == 1;
+        assert_eq!(record["may_be_used"], may_be_used, "{record}");
         for (name, key) in [
             ("length", "length_mm"),
             ("width", "width_mm"),
