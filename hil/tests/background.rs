@@ -45,10 +45,14 @@ impl Score {
     }
 }
 
-/// A sequence, its rectified frames and its true masks.
+/// Of each pixel of a frame whether it is a parcel's. Those at a parcel's border show part of it and are blurred by
+/// motion: they are neither (as in the `CDnet` benchmark, Goyette et al. 2012), and so is what the camera does not see.
+type Truth = Vec<Option<bool>>;
+
+/// A sequence, its rectified frames and what they show.
 struct Sequence {
     views: Vec<Mat>,
-    truth: Vec<Vec<bool>>,
+    truth: Vec<Truth>,
     ours: Score,
 }
 
@@ -84,25 +88,25 @@ fn dark() -> String {
     (0..5).map(parcel).collect()
 }
 
-/// Every pixel that the camera sees. Those at a parcel's border show part of it and are blurred by
-/// motion: they are neither (as in the `CDnet` benchmark, Goyette et al. 2012).
-fn count(
-    score: &mut Score,
-    seen: &[u64],
-    truth: &[bool],
-    width: usize,
-    is: impl Fn(usize) -> bool,
-) {
-    for (v, u) in (1..truth.len() / width - 1).flat_map(|v| (1..width - 1).map(move |u| (v, u))) {
+/// The truth of a frame from its exact mask.
+fn truth_of(mask: &[bool], seen: &[u64], width: usize) -> Truth {
+    let mut truth = vec![None; mask.len()];
+    for (v, u) in (1..mask.len() / width - 1).flat_map(|v| (1..width - 1).map(move |u| (v, u))) {
         let i = v * width + u;
-        let mut around = [i - width, i, i + width].into_iter().flat_map(|i| &truth[i - 1..=i + 1]);
-        if bits::get(&seen[v * words(width)..], u) && around.all(|t| *t == truth[i]) {
-            score.add(truth[i], is(i));
+        let mut around = [i - width, i, i + width].into_iter().flat_map(|i| &mask[i - 1..=i + 1]);
+        if bits::get(&seen[v * words(width)..], u) && around.all(|is| *is == mask[i]) {
+            truth[i] = Some(mask[i]);
         }
     }
+    truth
 }
 
-fn sequence(scenario: Scenario) -> (Sequence, Vec<u64>, usize) {
+fn count(score: &mut Score, truth: &[Option<bool>], is: impl Fn(usize) -> bool) {
+    let known = truth.iter().enumerate().filter_map(|(i, parcel)| parcel.map(|parcel| (i, parcel)));
+    known.for_each(|(i, parcel)| score.add(parcel, is(i)));
+}
+
+fn sequence(scenario: Scenario) -> Sequence {
     let mut scene = Scene::render(scenario);
     scene.site.config.background.shadow_ratio_min = SHADOW_RATIO_MIN;
     scene.site.config.background.threshold_sigma = THRESHOLD_SIGMA;
@@ -111,7 +115,6 @@ fn sequence(scenario: Scenario) -> (Sequence, Vec<u64>, usize) {
     let view = scene.site.view.clone();
     let [columns, rows] = view.size_px;
     let mut sequence = Sequence { views: Vec::new(), truth: Vec::new(), ours: Score::default() };
-    let mut seen = Vec::new();
     for (n, frame) in scene.frames.iter().enumerate() {
         let raw = Plane::packed(frame, width, height).expect("this size");
         let time = FrameTime { index: n as u64, t_s: n as f64 / FPS };
@@ -121,21 +124,21 @@ fn sequence(scenario: Scenario) -> (Sequence, Vec<u64>, usize) {
         (0..rows).for_each(|v| packed.extend_from_slice(grey.row(v)));
         let mat = Mat::new_rows_cols_with_data(rows as i32, columns as i32, &packed);
         sequence.views.push(mat.expect("a view").try_clone().expect("a copy"));
-        let mut truth = vec![false; columns * rows];
-        scene.source.parcel_mask(n as u64, &view, &mut truth);
-        seen = pipeline.seen().to_vec();
+        let mut mask = vec![false; columns * rows];
+        scene.source.parcel_mask(n as u64, &view, &mut mask);
+        let truth = truth_of(&mask, pipeline.seen(), columns);
         if n as u64 >= WARM_UP {
             let mask = pipeline.foreground();
             let is = |i: usize| bits::get(&mask[i / columns * words(columns)..], i % columns);
-            count(&mut sequence.ours, &seen, &truth, columns, is);
+            count(&mut sequence.ours, &truth, is);
         }
         sequence.truth.push(truth);
     }
-    (sequence, seen, columns)
+    sequence
 }
 
 fn theirs(
-    (sequence, seen, columns): &(Sequence, Vec<u64>, usize),
+    sequence: &Sequence,
     rate: f64,
     mut apply: impl FnMut(&Mat, &mut Mat, f64) -> opencv::Result<()>,
 ) -> Score {
@@ -147,7 +150,7 @@ fn theirs(
         if n as u64 >= WARM_UP {
             // Shadows are marked 127: they are background.
             let bytes = mask.data_bytes().expect("packed");
-            count(&mut score, seen, truth, *columns, |i| bytes[i] == 255);
+            count(&mut score, truth, |i| bytes[i] == 255);
         }
     }
     score
@@ -157,7 +160,7 @@ fn best(scores: impl Iterator<Item = (String, Score)>) -> (String, Score) {
     scores.max_by(|a, b| a.1.f1().total_cmp(&b.1.f1())).expect("settings")
 }
 
-fn mog2(sequence: &(Sequence, Vec<u64>, usize)) -> (String, Score) {
+fn mog2(sequence: &Sequence) -> (String, Score) {
     let settings = [2.0, 4.0, 9.0, 16.0]
         .into_iter()
         .flat_map(|threshold| [false, true].map(move |shadows| (threshold, shadows)))
@@ -172,7 +175,7 @@ fn mog2(sequence: &(Sequence, Vec<u64>, usize)) -> (String, Score) {
     }))
 }
 
-fn mog(sequence: &(Sequence, Vec<u64>, usize)) -> (String, Score) {
+fn mog(sequence: &Sequence) -> (String, Score) {
     let settings = [2.0, 5.0, 10.0, 15.0]
         .into_iter()
         .flat_map(|noise| [-1.0, 0.002, 0.0].map(move |rate| (noise, rate)));
@@ -186,7 +189,7 @@ fn mog(sequence: &(Sequence, Vec<u64>, usize)) -> (String, Score) {
     }))
 }
 
-fn gmg(sequence: &(Sequence, Vec<u64>, usize)) -> (String, Score) {
+fn gmg(sequence: &Sequence) -> (String, Score) {
     let settings = [0.6, 0.8, 0.9, 0.97]
         .into_iter()
         .flat_map(|threshold| [-1.0, 0.002].map(move |rate| (threshold, rate)));
@@ -213,7 +216,7 @@ fn our_foreground_is_at_least_as_true_as_that_of_mog2_mog_and_gmg_at_their_best(
     let mut behind = Vec::new();
     for (name, scenario) in scenes {
         let sequence = sequence(scenario);
-        let ours = sequence.0.ours;
+        let ours = sequence.ours;
         let rivals = [mog2(&sequence), mog(&sequence), gmg(&sequence)];
         let f1 = rivals.each_ref().map(|(_, score)| score.f1());
         println!("{name:14} {:6.4} {:6.4} {:6.4} {:6.4}", ours.f1(), f1[0], f1[1], f1[2]);
