@@ -1,5 +1,6 @@
 //! What leaves the pipeline: parcel records and counters.
 
+pub mod clock;
 pub mod csv;
 
 use serde::de::{Deserializer, Error as _};

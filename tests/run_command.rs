@@ -4,6 +4,7 @@ mod common;
 
 use common::{beltgauge, scratch, write_site};
 use std::fs;
+use std::net::UdpSocket;
 use std::path::Path;
 use std::process::{Child, Stdio};
 use std::time::{Duration, Instant};
@@ -274,4 +275,26 @@ fn an_error_reaches_whoever_is_slow_to_read_it() {
     let text = String::from_utf8_lossy(&text);
     assert!(text.contains("error: ") && text.contains("no-such-file.toml"), "lost");
     assert_eq!(status(&mut check), Some(2));
+}
+
+#[test]
+fn a_collector_gets_the_log_and_one_that_goes_away_is_not_missed() {
+    let folder = scratch("run-syslog");
+    let collector = UdpSocket::bind("127.0.0.1:0").expect("a free port");
+    collector.set_read_timeout(Some(Duration::from_secs(30))).expect("settable");
+    let address = collector.local_addr().expect("bound");
+    let camera = format!("device = \"/dev/video99\"\n[log]\nsyslog = \"{address}\"");
+    let mut run = start(&folder, &camera, &[]);
+    let mut line = [0; 4096];
+    let mut received = || {
+        let length = collector.recv(&mut line).expect("sent");
+        String::from_utf8_lossy(&line[..length]).into_owned()
+    };
+    let told = std::iter::repeat_with(&mut received).find(|line| line.contains("/dev/video99"));
+    let told = told.expect("endless");
+    // An error of a system daemon, version 1, from a program of this name.
+    assert!(told.starts_with("<27>1 20") && told.contains(" beltgauge "), "{told}");
+    drop(collector);
+    assert_eq!(terminate(&mut run), Some(0));
+    wait_for(&folder.join("log"), &["stopped"]);
 }

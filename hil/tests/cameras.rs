@@ -259,3 +259,18 @@ fn a_camera_that_was_lost_comes_back() {
         }
     }
 }
+
+#[test]
+fn the_binary_that_ships_has_no_aravis_and_names_the_feature() {
+    let folder = hil::fleet::folder("no-aravis");
+    let example = hil::project().join("config/example");
+    std::fs::copy(example.join("camera.toml"), folder.join("camera.toml")).expect("committed");
+    let text = std::fs::read_to_string(example.join("beltgauge.toml")).expect("committed");
+    let text = text.replace("[zone]", "interface = \"aravis\"\n[zone]");
+    let config = folder.join("beltgauge.toml");
+    std::fs::write(&config, text).expect("room");
+    let output = Command::new(hil::beltgauge()).arg("run").arg(&config).output().expect("starts");
+    let text = String::from_utf8_lossy(&output.stderr);
+    assert_eq!(output.status.code(), Some(2), "{text}");
+    assert!(text.contains("--features aravis") && text.contains("remedy"), "{text}");
+}

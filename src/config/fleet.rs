@@ -1,5 +1,6 @@
 //! `[fleet]`: the broker that many machines of a site report to.
 
+use super::ranges;
 use crate::error::{Error, Result};
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
@@ -50,10 +51,8 @@ impl Fleet {
                 _ => {}
             }
         }
-        if let Some(broker) = self.broker.filter(|b| b.port() == 0 || b.ip().is_unspecified()) {
-            return Err(Error::configuration(format!("fleet.broker = \"{broker}\""))
-                .allowed("address and port of a broker, as \"192.168.1.5:1883\"")
-                .remedy("give the broker's own address and port"));
+        if let Some(broker) = self.broker {
+            ranges::other_machine("fleet.broker", broker, "192.168.1.5:1883")?;
         }
         if self.tls_name.is_some() && self.ca_file.is_none() {
             return Err(Error::configuration("fleet.tls_name is set, but fleet.ca_file is not")

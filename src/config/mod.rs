@@ -17,7 +17,7 @@ pub use schema::{
     Background, CameraTable, Config, Import, Interface, Limits, Measure, Odometry, Realtime,
     Segment, View, public_key,
 };
-pub use service::{Archive, Web};
+pub use service::{Archive, Log, Web};
 
 use crate::camera::{BeltView, Camera, CameraFile};
 use crate::error::{Error, Result};

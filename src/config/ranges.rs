@@ -1,6 +1,7 @@
 //! What every number of a configuration may be: one table for the check and for the JSON Schema.
 
 use crate::error::{Error, Result};
+use std::net::SocketAddr;
 
 /// Key, smallest value, largest value, unit.
 type Range = (&'static str, f64, f64, &'static str);
@@ -90,4 +91,13 @@ pub(super) fn range(key: &str, value: f64, min: f64, max: f64, unit: &str) -> Re
     Err(Error::configuration(format!("{key} = {value}"))
         .allowed(format!("{min} to {max} {unit}").trim_end())
         .remedy(remedy))
+}
+/// Refuse what is no place that another machine can be reached at.
+pub(super) fn other_machine(key: &str, address: SocketAddr, example: &str) -> Result<()> {
+    if address.port() != 0 && !address.ip().is_unspecified() {
+        return Ok(());
+    }
+    Err(Error::configuration(format!("{key} = \"{address}\""))
+        .allowed(format!("address and port of another machine, as \"{example}\""))
+        .remedy("give that machine's own address and port"))
 }

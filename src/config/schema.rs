@@ -4,7 +4,7 @@ use super::fleet::Fleet;
 use super::health::Health;
 use super::plc::{Can, Encoder, Modbus, Plc};
 use super::ranges::{self, range};
-use super::service::{Archive, Web};
+use super::service::{Archive, Log, Web};
 use crate::error::{Error, Result};
 use crate::units::BeltRect;
 use minisign_verify::PublicKey;
@@ -70,6 +70,9 @@ pub struct Config {
     /// `[fleet]`
     #[serde(default)]
     pub fleet: Fleet,
+    /// `[log]`
+    #[serde(default)]
+    pub log: Log,
 }
 
 /// How a live camera is reached.
@@ -332,7 +335,7 @@ impl Config {
 
     /// What the table of ranges cannot say.
     fn check(&self) -> Result<()> {
-        let Self { camera, zone, plc, modbus, can, encoder, import, web, fleet, .. } = self;
+        let Self { camera, zone, plc, modbus, can, encoder, import, web, fleet, log, .. } = self;
         camera.check()?;
         for (key, mm) in [
             ("zone.x_max_mm - zone.x_min_mm", zone.x_max_mm - zone.x_min_mm),
@@ -346,6 +349,7 @@ impl Config {
         check_writers(plc, modbus, can, encoder)?;
         web.check()?;
         fleet.check()?;
+        log.check()?;
         import.public_key.as_deref().map_or(Ok(()), |key| public_key(key).map(drop))
     }
 }

@@ -1,9 +1,10 @@
-//! The tables of what people see: the web page, and the archive behind it.
+//! The tables of what people see: the web page, the archive behind it, and the log.
 
+use super::ranges;
 use crate::error::{Error, Result};
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
-use std::net::{IpAddr, Ipv4Addr};
+use std::net::{IpAddr, Ipv4Addr, SocketAddr};
 use std::path::PathBuf;
 
 /// `[web]`: the page for people, and figures for machines.
@@ -53,6 +54,20 @@ pub struct Archive {
 impl Default for Archive {
     fn default() -> Self {
         Self { folder: None, mib_max: 2048 }
+    }
+}
+
+/// `[log]`: a copy of the log for a site's collector.
+#[derive(Clone, Debug, Default, PartialEq, Eq, Deserialize, Serialize, JsonSchema)]
+#[serde(deny_unknown_fields, default)]
+pub struct Log {
+    /// Address and port of a syslog server (RFC 5424 over UDP), in numbers; none given: none.
+    pub syslog: Option<SocketAddr>,
+}
+
+impl Log {
+    pub(super) fn check(&self) -> Result<()> {
+        self.syslog.map_or(Ok(()), |to| ranges::other_machine("log.syslog", to, "192.168.1.5:514"))
     }
 }
 

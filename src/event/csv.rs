@@ -1,7 +1,7 @@
 //! Parcel records as CSV, as other programs read them.
 
+use super::clock::utc;
 use serde_json::Value;
-use std::time::{Duration, SystemTime};
 
 /// The columns of a parcel's line, named as in its record.
 const NAMES: [&str; 21] = [
@@ -31,13 +31,6 @@ const NAMES: [&str; 21] = [
 /// The line above the others. `number`: what their first cell counts.
 pub fn header(number: &str) -> String {
     format!("{number},utc,{}", NAMES.join(","))
-}
-
-/// A time as RFC 3339 has it, in UTC.
-pub fn utc(utc_ms: u64) -> String {
-    // Up to the year 9999, as the format goes.
-    let since_1970 = Duration::from_millis(utc_ms.min(253_402_300_799_999));
-    humantime::format_rfc3339_millis(SystemTime::UNIX_EPOCH + since_1970).to_string()
 }
 
 /// A record, as JSON has it, as a line; what it lacks is empty.

@@ -3,13 +3,12 @@
 
 use super::topics::Topics;
 use super::{Entry, Kind};
-use crate::event::csv::utc;
+use crate::event::clock::{utc, utc_ms};
 use schemars::JsonSchema;
 use schemars::generate::SchemaSettings;
 use serde::{Deserialize, Serialize};
 use std::sync::Arc;
 use std::sync::atomic::{AtomicU64, Ordering};
-use std::time::{SystemTime, UNIX_EPOCH};
 
 /// Version of the schema.
 const SCHEMA: u8 = 1;
@@ -23,11 +22,6 @@ pub struct Identity {
     boots: u16,
     /// Events of the fleet's own, since start.
     told: Arc<AtomicU64>,
-}
-
-/// The machine's clock, ms since 1970.
-pub fn utc_ms() -> u64 {
-    SystemTime::now().duration_since(UNIX_EPOCH).map_or(0, |since| since.as_millis() as u64)
 }
 
 /// How well the machine's clock is known to agree with the world's.

@@ -2,7 +2,7 @@
 
 use crate::archive::{Kind, Reader, Stored};
 use crate::error::{Error, Result};
-use crate::event::csv as columns;
+use crate::event::{clock, csv as columns};
 use std::fmt::Write as _;
 use std::fs::File;
 use std::io::{BufWriter, Write};
@@ -29,7 +29,7 @@ pub fn list(folder: &Path, last: usize) -> Result<String> {
             text,
             "{:8}  {}  {}",
             stored.number,
-            columns::utc(stored.entry.utc_ms),
+            clock::utc(stored.entry.utc_ms),
             line(&stored)
         );
     }

@@ -1,6 +1,6 @@
 //! `beltgauge run`: the appliance on a live camera, until it is told to stop.
 
-use super::{Appliance, ImportBoard, Progress, Watchdog, log, memory};
+use super::{Appliance, ImportBoard, Progress, Watchdog, log, memory, syslog};
 use crate::config::{Can, Site};
 use crate::error::{Error, Result};
 use crate::event::ParcelRecord;
@@ -45,6 +45,8 @@ pub fn run(options: &Options<'_>) -> Result<()> {
         store.settle();
     }
     let mut site = options.config.map_or_else(|| store.site(), Site::load)?;
+    // To the end: then the last lines are sent.
+    let _collector = site.config.log.syslog.map(syslog::start).transpose()?;
     check_interface(site.config.camera.interface)?;
     if options.config.is_none() {
         site.config.plc.state_file.get_or_insert_with(|| store.plc_state());

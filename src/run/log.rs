@@ -3,6 +3,7 @@
 //! Lines go through a bounded queue to a thread of its own. When nobody reads and the queue is full,
 //! lines are dropped, counted and told.
 
+use super::syslog::{self, Syslog};
 use std::io::Write;
 use std::sync::OnceLock;
 use std::sync::mpsc::sync_channel;
@@ -10,6 +11,8 @@ use std::time::Duration;
 use tracing::Level;
 use tracing_appender::non_blocking::{NonBlocking, NonBlockingBuilder, WorkerGuard};
 use tracing_subscriber::EnvFilter;
+use tracing_subscriber::layer::SubscriberExt;
+use tracing_subscriber::util::SubscriberInitExt;
 
 /// Lines that wait to be read; a line is some 200 bytes.
 const LINES_MAX: usize = 4096;
@@ -39,8 +42,8 @@ pub fn start(level: Level, format: Format) -> WorkerGuard {
     let filter = EnvFilter::builder().with_default_directive(level.into()).from_env_lossy();
     let log = tracing_subscriber::fmt().with_env_filter(filter).with_writer(writer.clone());
     match format {
-        Format::Text => log.init(),
-        Format::Json => log.json().init(),
+        Format::Text => log.finish().with(Syslog).init(),
+        Format::Json => log.json().finish().with(Syslog).init(),
     }
     let _ = STDERR.set(writer);
     guard
@@ -69,7 +72,8 @@ pub fn last_words(text: String) {
     }
 }
 
-/// Lines that were dropped since start because nobody read.
+/// Lines that were dropped since start because nobody took them.
 pub fn lines_dropped() -> u64 {
-    STDERR.get().map_or(0, |writer| writer.error_counter().dropped_lines() as u64)
+    let unread = STDERR.get().map_or(0, |writer| writer.error_counter().dropped_lines() as u64);
+    unread + syslog::lines_dropped()
 }

@@ -22,6 +22,7 @@ pub mod outputs;
 pub mod privileges;
 mod realtime;
 mod report;
+mod syslog;
 pub mod update;
 mod watchdog;
 

@@ -4,6 +4,7 @@ use super::bundle::{self, Papers};
 use super::lamps::lamps;
 use crate::archive::{Condition, Page, Reader, Stored};
 use crate::config::{Config, WordOrder};
+use crate::event::clock::utc_ms;
 use crate::plc::clients::{Client, ClientList};
 use crate::plc::command::Sender;
 use crate::plc::link::Link;
@@ -16,7 +17,7 @@ use crate::web;
 use std::path::PathBuf;
 use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
 use std::sync::{Mutex, MutexGuard, PoisonError};
-use std::time::{Duration, Instant, SystemTime, UNIX_EPOCH};
+use std::time::{Duration, Instant};
 
 /// The PLC thread tells this often.
 const PERIOD: Duration = Duration::from_millis(100);
@@ -63,11 +64,6 @@ impl PlcSide {
 
 fn lock<T>(mutex: &Mutex<T>) -> MutexGuard<'_, T> {
     mutex.lock().unwrap_or_else(PoisonError::into_inner)
-}
-
-/// The machine's clock, ms since 1970.
-pub fn utc_ms() -> u64 {
-    SystemTime::now().duration_since(UNIX_EPOCH).map_or(0, |since| since.as_millis() as u64)
 }
 
 impl Insight {
