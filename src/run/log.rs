@@ -72,7 +72,7 @@ pub fn last_words(text: String) {
     }
 }
 
-/// Lines that were dropped since start because nobody took them.
+/// Lines that were dropped since start because they found no room.
 pub fn lines_dropped() -> u64 {
     let unread = STDERR.get().map_or(0, |writer| writer.error_counter().dropped_lines() as u64);
     unread + syslog::lines_dropped()

@@ -1,7 +1,7 @@
 //! A copy of the log for a site's collector: messages of RFC 5424 in UDP datagrams (RFC 5426).
 //!
 //! Nobody waits for the network: as those of `log`, lines go through a bounded queue to a thread of its own. What is
-//! sent while nobody listens is lost, which UDP does not tell.
+//! sent while nobody listens, or the network is away, is lost and not counted: the line that told of it would be lost too.
 
 use crate::error::{Error, Result};
 use crate::event::clock;
@@ -49,7 +49,7 @@ pub fn start(to: SocketAddr) -> Result<WorkerGuard> {
     Ok(guard)
 }
 
-/// Lines that were dropped since start because the network took none.
+/// Lines that were dropped since start because they found no room.
 pub fn lines_dropped() -> u64 {
     COLLECTOR.get().map_or(0, |to| to.lines.error_counter().dropped_lines() as u64)
 }
