@@ -67,6 +67,9 @@ pub enum Command {
         /// Address and port of the page [default: 127.0.0.1:8080, for this computer alone].
         #[arg(long, value_name = "ADDRESS:PORT", help_heading = BELT)]
         page: Option<SocketAddr>,
+        /// Show a chessboard instead of parcels, to try the page's "Set up".
+        #[arg(long, help_heading = BELT)]
+        board: bool,
         /// Folder for the table, the records and the annotated pictures.
         #[arg(long, value_name = "DIR", default_value = "demo-out", help_heading = RESULTS)]
         out: PathBuf,

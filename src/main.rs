@@ -88,9 +88,9 @@ impl Observer for Console {
 
 fn dispatch(command: Command) -> Result<()> {
     match command {
-        Command::Demo { seconds, out, listen, page, config, record } => {
+        Command::Demo { seconds, out, listen, page, config, record, board } => {
             let (config, record) = (config.as_deref(), record.as_deref());
-            let options = demo::Options { seconds, out: &out, listen, page, config, record };
+            let options = demo::Options { seconds, out: &out, listen, page, config, record, board };
             let table = demo::run(options)?;
             print(format_args!("{table}\npictures and records are in {}", out.display()))
         }

@@ -174,6 +174,12 @@ fn what_is_there_is_served_and_every_answer_is_protected() {
         ("/api/parcels/-1/picture", 404),
         ("/api/live/up", 404),
         ("/api/live/belt?after=x", 400),
+        ("/api/live/setup?columns=9&rows=2", 400),
+        ("/api/live/setup?columns=300&rows=6", 400),
+        ("/api/live/setup?columns=9&rows=x", 400),
+        ("/api/still/7", 404),
+        ("/api/still/-1", 404),
+        ("/api/still/..%2f7", 404),
         ("/api/parcels?since=-1", 400),
         ("/api/parcels?since=%31", 400),
         ("/api/parcels?limit=99999999999999999999999", 400),
@@ -201,6 +207,30 @@ fn what_is_there_is_served_and_every_answer_is_protected() {
         Some(100),
         "however many are asked for"
     );
+}
+
+#[test]
+fn the_last_stills_of_a_board_are_kept_and_the_board_is_looked_for_as_it_was_asked() {
+    let server = Server::start();
+    assert_eq!(server.board.looked_for(), None);
+    for frame in 0..10 {
+        server.board.whole(frame, format!("P5 {frame}").into_bytes());
+    }
+    let kept: Vec<u64> = (0..10)
+        .filter(|frame| status(&server.get(&format!("/api/still/{frame}"))) == 200)
+        .collect();
+    assert_eq!(kept, [6, 7, 8, 9], "the last four");
+    assert!(server.get("/api/still/9").ends_with("\r\n\r\nP5 9"));
+    for (query, looked_for) in [
+        ("?columns=9&rows=6", Some([9, 6])),
+        ("?columns=3&rows=60&after=5", Some([3, 60])),
+        ("", None),
+    ] {
+        // Answered at once: there is a picture.
+        server.board.picture(View::Setup, 7, b"{}\njpeg".to_vec());
+        assert_eq!(status(&server.get(&format!("/api/live/setup{query}"))), 200, "{query}");
+        assert_eq!(server.board.looked_for(), looked_for, "{query}");
+    }
 }
 
 #[test]

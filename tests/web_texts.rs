@@ -12,7 +12,7 @@ fn page(name: &str) -> String {
     std::fs::read_to_string(path).expect("committed")
 }
 
-const SCRIPTS: [&str; 8] = [
+const SCRIPTS: [&str; 10] = [
     "main.js",
     "common.js",
     "live.js",
@@ -21,6 +21,8 @@ const SCRIPTS: [&str; 8] = [
     "trend.js",
     "plc.js",
     "events.js",
+    "setup.js",
+    "stills.js",
 ];
 
 #[test]
@@ -59,6 +61,16 @@ fn every_word_is_there_in_both_languages() {
         let name = serde_json::to_value(why).expect("a word");
         needed.insert(format!("no_picture.{}", name.as_str().expect("a word")));
     }
+    for name in ["none", "lens", "belt"] {
+        needed.insert(format!("setup.board.for_{name}"));
+    }
+    for name in ["columns", "rows", "square_mm", "thickness_mm", "good", "no_grid", "another_grid"]
+        .into_iter()
+        .chain(["markers", "corner_hidden", "moves", "known", "full", "ready"])
+    {
+        needed.insert(format!("setup.board.{name}"));
+    }
+    needed.extend((0..9).map(|part| format!("setup.part.{part}")));
     for kind in ["started", "stopped", "began", "ended", "camera_lost", "command", "import"] {
         needed.insert(format!("event.{kind}"));
     }

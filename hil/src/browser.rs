@@ -1,13 +1,13 @@
 //! A real browser: Debian's Chromium, driven over WebDriver.
 
-use crate::wait_for;
+use crate::{project, wait_for};
 use fantoccini::wd::WebDriverCompatibleCommand;
 use fantoccini::{Client, ClientBuilder};
 use http::Method;
 use hyper_util::client::legacy::connect::HttpConnector;
 use serde_json::{Value, json};
 use std::net::{TcpListener, TcpStream};
-use std::path::Path;
+use std::path::{Path, PathBuf};
 use std::process::{Child, Command, Stdio};
 use std::time::Duration;
 use url::{ParseError, Url};
@@ -17,6 +17,11 @@ pub struct Browser {
     driver: Child,
     /// What drives it.
     pub client: Client,
+}
+
+/// Where files go that a page offers. A browser that finds `..` in its path waits for ever.
+pub fn downloads() -> PathBuf {
+    project().canonicalize().expect("it is there").join("target/hil-out/downloads")
 }
 
 /// Ask the browser for what its console says; Chromium only.
@@ -55,7 +60,7 @@ impl Browser {
             "goog:chromeOptions": { "args": [
                 "--headless=new", "--no-sandbox", "--disable-gpu", "--disable-dev-shm-usage",
                 "--lang=en", format!("--window-size={width},{height}"),
-            ] },
+            ], "prefs": { "download.default_directory": downloads() } },
         });
         let Value::Object(options) = options else { unreachable!("it is an object") };
         let client = ClientBuilder::new(HttpConnector::new())

@@ -9,6 +9,7 @@ pub mod calibrate;
 mod calibration_file;
 pub mod chessboard;
 mod file;
+pub mod focus;
 mod lens;
 mod view;
 

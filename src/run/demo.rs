@@ -27,6 +27,9 @@ const SECONDS_MAX: f64 = 1e6;
 /// The console line is renewed this often.
 const CONSOLE_PERIOD: Duration = Duration::from_millis(200);
 
+/// Instead of the table, when there were no parcels.
+const BOARD_SHOWN: &str = "A chessboard was shown, and no parcels.\n";
+
 /// What to run.
 #[derive(Clone, Copy, Debug)]
 pub struct Options<'a> {
@@ -42,6 +45,8 @@ pub struct Options<'a> {
     pub config: Option<&'a Path>,
     /// Folder for a recording, and all that measuring it again and calibrating its camera needs.
     pub record: Option<&'a Path>,
+    /// Show a chessboard instead of parcels, to try the page's set-up.
+    pub board: bool,
 }
 
 /// The demo's scenario.
@@ -128,6 +133,10 @@ pub fn run(options: Options<'_>) -> Result<String> {
         return Err(Error::configuration(format!("--seconds {}", options.seconds))
             .allowed(format!("1 to {SECONDS_MAX:.0}, or 0: until Ctrl-C")));
     }
+    if options.board && options.record.is_some() {
+        return Err(Error::configuration("--board and --record")
+            .remedy("leave one out: --record writes stills of the board too"));
+    }
     if endless && options.record.is_some() {
         return Err(Error::configuration("--record without an end: 30 MB a second fill any disk")
             .remedy("say how long, for example --seconds 60"));
@@ -165,7 +174,13 @@ pub fn run(options: Options<'_>) -> Result<String> {
     };
     let appliance = Appliance::new(site)?;
     let page = page_words(appliance.page_address(), web);
-    let mut paced = Paced::new(&mut source, Pace::RealTime);
+    let mut board =
+        options.board.then(|| demo_kit::BoardShow::new(&scenario, &camera)).transpose()?;
+    let shown: &mut dyn FrameSource = match &mut board {
+        Some(board) => board,
+        None => &mut source,
+    };
+    let mut paced = Paced::new(shown, Pace::RealTime);
     let mut recorder = None;
     let feed: &mut dyn Feed = match options.record {
         None => &mut paced,
@@ -178,7 +193,13 @@ pub fn run(options: Options<'_>) -> Result<String> {
             recorder
         }
     };
-    let text = introduction(&scenario, options.seconds, &page, listen, options.out);
+    let text = if options.board {
+        format!(
+            "{page}\nUnder \"Set up\" a chessboard is shown, held and on the belt, instead of parcels.\n"
+        )
+    } else {
+        introduction(&scenario, options.seconds, &page, listen, options.out)
+    };
     log::say(format_args!("{text}"));
     let (start, mut shown) = (Instant::now(), Instant::now());
     let progress = appliance.run(feed, |progress, new| {
@@ -195,6 +216,9 @@ pub fn run(options: Options<'_>) -> Result<String> {
         log::say(format_args!("{}\n", recorder.finish()?));
     }
     results.finish()?;
+    if options.board {
+        return Ok(BOARD_SHOWN.to_owned());
+    }
     let [width, height] = source.size_px();
     let mut frame = vec![0; width * height];
     for record in results.kept() {

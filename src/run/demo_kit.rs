@@ -1,16 +1,20 @@
-//! What `demo --record` puts beside its recording: a site, its camera, and stills to calibrate it with.
+//! What the demo has of a board: the stills that `demo --record` puts beside its recording, with a site and
+//! its camera, and `demo --board` shows instead of parcels.
 
 use crate::camera::chessboard::Chessboard;
 use crate::camera::{BeltTable, CalibrationFile, Camera};
 use crate::error::{Error, Result};
-use crate::source::Still;
+use crate::image::FrameTime;
 use crate::source::synthetic::{BoardStills, Scenario, held_poses};
+use crate::source::{FrameSource, Still};
 use std::path::Path;
 
 /// The board that README calibrates with: 10 by 7 squares, glued to something of 3 mm.
 const CORNERS: [usize; 2] = [9, 6];
 const SQUARE_MM: f64 = 25.0;
 const THICKNESS_MM: f64 = 3.0;
+/// So long a still is shown.
+const STILL_S: f64 = 1.0;
 /// Where the board's first corner lies in the stills of its way, and how it is turned.
 const PASS_X_MM: [f64; 4] = [-430.0, -220.0, 20.0, 240.0];
 const PASS_Y_MM: f64 = 90.0;
@@ -38,26 +42,71 @@ pub(super) fn write(
     }
     std::fs::write(folder.join("beltgauge.toml"), config).map_err(failed)?;
     true_camera(camera).save(&folder.join("camera.toml"), "beltgauge demo --record")?;
-    let board = Chessboard::new(CORNERS, SQUARE_MM);
-    let mut stills = BoardStills::new(scenario.clone(), board)?;
-    let save = |still: &Still, part: &str, k: usize| {
+    for (part, k, still) in stills(scenario, camera)? {
         let [width, height] = still.size_px.map(|n| n as u32);
         let path = folder.join(part).join(format!("{k:02}.png"));
         image::save_buffer(&path, &still.pixels, width, height, image::ExtendedColorType::L8)
-            .map_err(|e| Error::failure(format!("cannot write a still: {e}")).in_file(&path))
-    };
+            .map_err(|e| Error::failure(format!("cannot write a still: {e}")).in_file(&path))?;
+    }
+    Ok(())
+}
+
+/// Every still of the board: its folder, its number there, its picture.
+fn stills(scenario: &Scenario, camera: &Camera) -> Result<Vec<(&'static str, usize, Still)>> {
+    let board = Chessboard::new(CORNERS, SQUARE_MM);
+    let mut stills = BoardStills::new(scenario.clone(), board)?;
+    let mut all = Vec::new();
     for (k, (angles_deg, middle_mm)) in
         held_poses(&camera.lens, camera.image_size_px).into_iter().enumerate()
     {
-        save(&stills.held(angles_deg, middle_mm), "views", k)?;
+        all.push(("views", k, stills.held(angles_deg, middle_mm)));
     }
     for (k, x_mm) in PASS_X_MM.into_iter().enumerate() {
-        save(&stills.on_belt([x_mm, PASS_Y_MM], PASS_YAW_DEG, THICKNESS_MM), "pass", k)?;
+        let still = stills.on_belt([x_mm, PASS_Y_MM], PASS_YAW_DEG, THICKNESS_MM);
+        all.push(("pass", k, still));
     }
     for (k, (corner_mm, yaw_deg)) in ELSEWHERE.into_iter().enumerate() {
-        save(&stills.on_belt(corner_mm, yaw_deg, THICKNESS_MM), "elsewhere", k)?;
+        all.push(("elsewhere", k, stills.on_belt(corner_mm, yaw_deg, THICKNESS_MM)));
     }
-    Ok(())
+    Ok(all)
+}
+
+/// A camera that is shown the board: held 15 times, carried by the belt to four places, and again.
+pub(super) struct BoardShow {
+    stills: Vec<Still>,
+    fps: f64,
+    next_index: u64,
+}
+
+impl BoardShow {
+    /// By the camera of a scenario. Its stills are drawn now: it takes a few seconds.
+    pub(super) fn new(scenario: &Scenario, camera: &Camera) -> Result<Self> {
+        let all = stills(scenario, camera)?.into_iter();
+        let stills = all.filter(|(part, ..)| *part != "elsewhere").map(|(.., still)| still);
+        Ok(Self { stills: stills.collect(), fps: scenario.fps, next_index: 0 })
+    }
+}
+
+impl FrameSource for BoardShow {
+    fn size_px(&self) -> [usize; 2] {
+        self.stills[0].size_px
+    }
+
+    fn fps(&self) -> f64 {
+        self.fps
+    }
+
+    fn next_into(&mut self, frame: &mut [u8]) -> Result<Option<FrameTime>> {
+        let (index, t_s) = (self.next_index, self.next_index as f64 / self.fps);
+        let shown = (t_s / STILL_S) as usize % self.stills.len();
+        frame.copy_from_slice(&self.stills[shown].pixels);
+        self.next_index += 1;
+        Ok(Some(FrameTime { index, t_s }))
+    }
+
+    fn skip(&mut self, count: u64) {
+        self.next_index += count;
+    }
 }
 
 /// The camera that rendered the recording, as `calibrate` would write it: without error.

@@ -23,6 +23,8 @@ use tokio::sync::Semaphore;
 
 /// A request for a live picture waits this long for one that is due.
 const PICTURE_PATIENCE: Duration = Duration::from_secs(1);
+/// Inner corners along a side of a board.
+const BOARD_SIDES: std::ops::RangeInclusive<u8> = 3..=60;
 /// Entries of the archive in one answer.
 const ARCHIVED_MAX: usize = 100;
 /// Pieces of the trend in one answer; a page asks until there are no more.
@@ -68,6 +70,7 @@ pub(super) fn router(board: Arc<Board>, machine: Arc<dyn Machine>, settings: &Se
         .route("/api/events", get(events))
         .route("/api/trend", get(trend))
         .route("/api/live/{view}", get(live))
+        .route("/api/still/{frame}", get(still))
         .route("/api/archive", get(archive))
         .route("/api/archive/{entry}/picture", get(archive_picture))
         .route("/api/bundle.tar.gz", get(bundle))
@@ -261,8 +264,12 @@ async fn live(
     let view = match view.as_str() {
         "belt" => View::Belt,
         "raw" => View::Raw,
-        _ => return Err(refusal(StatusCode::NOT_FOUND, "the views are belt and raw")),
+        "setup" => View::Setup,
+        _ => return Err(refusal(StatusCode::NOT_FOUND, "the views are belt, raw and setup")),
     };
+    if view == View::Setup {
+        from.board.look_for(board_sides(query.as_deref())?);
+    }
     let shown = number(query.as_deref(), "after")?;
     let next = from.board.next_picture(view, shown);
     Ok(match tokio::time::timeout(from.patience, next).await {
@@ -272,6 +279,25 @@ async fn live(
         }
         Err(_) => StatusCode::NO_CONTENT.into_response(),
     })
+}
+
+/// Inner corners of the board to look for, as in `columns=9&rows=6`.
+fn board_sides(query: Option<&str>) -> Result<Option<[u8; 2]>, Response> {
+    let (columns, rows) = (number(query, "columns")?, number(query, "rows")?);
+    let (Some(columns), Some(rows)) = (columns, rows) else { return Ok(None) };
+    let side = |n: u64| u8::try_from(n).ok().filter(|n| BOARD_SIDES.contains(n));
+    let wrong = "a board has 3 to 60 inner corners along each side";
+    let sides =
+        side(columns).zip(side(rows)).ok_or_else(|| refusal(StatusCode::BAD_REQUEST, wrong))?;
+    Ok(Some(sides.into()))
+}
+
+/// The camera's picture of a frame that showed a board just now, every pixel of it.
+async fn still(State(from): State<Sources>, Path(frame): Path<String>) -> Response {
+    match frame.parse().ok().and_then(|frame| from.board.whole_picture(frame)) {
+        Some(file) => ([(header::CONTENT_TYPE, "image/x-portable-graymap")], file).into_response(),
+        None => refusal(StatusCode::NOT_FOUND, "that picture is not kept, or no longer"),
+    }
 }
 
 /// Ask the disk on a thread that may wait for it.

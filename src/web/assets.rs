@@ -21,6 +21,8 @@ pub(super) const ASSETS: &[(&str, &str, &[u8])] = &[
     ("/plc.js", SCRIPT, include_bytes!("page/plc.js")),
     ("/events.js", SCRIPT, include_bytes!("page/events.js")),
     ("/trend.js", SCRIPT, include_bytes!("page/trend.js")),
+    ("/setup.js", SCRIPT, include_bytes!("page/setup.js")),
+    ("/stills.js", SCRIPT, include_bytes!("page/stills.js")),
     // As it is published: https://github.com/leeoniya/uPlot, version 1.6.32.
     ("/uplot.js", SCRIPT, include_bytes!("page/uplot/uPlot.iife.min.js")),
     ("/uplot.css", CSS, include_bytes!("page/uplot/uPlot.min.css")),

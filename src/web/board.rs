@@ -24,7 +24,14 @@ pub enum View {
     Raw,
     /// The belt view.
     Belt,
+    /// What helps to set the camera up ([`super::Setup`]).
+    Setup,
 }
+
+/// Kinds of live pictures.
+const VIEWS: usize = 3;
+/// Whole pictures that are kept for whoever wants one of those that he has just been shown.
+const WHOLE_MAX: usize = 4;
 
 /// A live picture, ready to be sent.
 #[derive(Debug)]
@@ -47,9 +54,13 @@ pub struct Board {
     points: Mutex<VecDeque<Point>>,
     parcels_told: AtomicU64,
     events_told: AtomicU64,
-    live: [Live; 2],
+    live: [Live; VIEWS],
     /// Requests that wait for a picture.
-    waiting: [AtomicUsize; 2],
+    waiting: [AtomicUsize; VIEWS],
+    /// The camera's last pictures with a board, by number of the frame.
+    whole: Mutex<VecDeque<(u64, axum::body::Bytes)>>,
+    /// Inner corners of the board that is looked for: columns * 256 + rows; 0: none.
+    board: AtomicUsize,
     /// Who makes the pictures.
     desk: OnceLock<Thread>,
     closed: watch::Sender<bool>,
@@ -69,8 +80,10 @@ impl Board {
             points: Mutex::new(VecDeque::with_capacity(POINTS_MAX)),
             parcels_told: AtomicU64::new(0),
             events_told: AtomicU64::new(0),
-            live: [watch::Sender::new(None), watch::Sender::new(None)],
+            live: std::array::from_fn(|_| watch::Sender::new(None)),
             waiting: Default::default(),
+            whole: Mutex::default(),
+            board: AtomicUsize::new(0),
             desk: OnceLock::new(),
             closed: watch::Sender::new(false),
         }
@@ -145,6 +158,29 @@ impl Board {
     pub fn picture(&self, view: View, frame: u64, bytes: Vec<u8>) {
         let picture = Picture { frame, at: Instant::now(), bytes: bytes.into() };
         self.live[view as usize].send_replace(Some(Arc::new(picture)));
+    }
+
+    /// Look for a board of so many inner corners in the pictures for setting up; none: for no board.
+    pub(super) fn look_for(&self, board: Option<[u8; 2]>) {
+        let sides = board.map_or(0, |[a, b]| usize::from(a) << 8 | usize::from(b));
+        self.board.store(sides, Ordering::Relaxed);
+    }
+
+    /// Inner corners of the board that is looked for.
+    pub fn looked_for(&self) -> Option<[usize; 2]> {
+        let sides = self.board.load(Ordering::Relaxed);
+        (sides > 0).then_some([sides >> 8, sides & 0xff])
+    }
+
+    /// Keep the camera's picture of a frame for a while, as a file.
+    pub fn whole(&self, frame: u64, file: Vec<u8>) {
+        put(&mut lock(&self.whole), WHOLE_MAX, (frame, file.into()));
+    }
+
+    /// The camera's picture of a frame, if it is still kept.
+    pub(super) fn whole_picture(&self, frame: u64) -> Option<axum::body::Bytes> {
+        let kept = lock(&self.whole);
+        kept.iter().find(|(kept, _)| *kept == frame).map(|(_, file)| file.clone())
     }
 
     /// A fresh picture of another frame than `shown`, as soon as there is one.

@@ -20,8 +20,8 @@ mod server;
 
 pub use board::{Board, Picture, View};
 pub use model::{
-    ArchiveState, Archived, BeltState, BundleFile, BundleFiles, CameraState, Client, Counts,
-    Cuboid, Event, Field, Lamp, Machine, NoPicture, Parcel, ParcelPicture, Plc, Point, Scene,
-    Sight, State, Written,
+    ArchiveState, Archived, BeltState, BoardSeen, BundleFile, BundleFiles, CameraState, Client,
+    Counts, Cuboid, Event, Field, Lamp, Machine, NoPicture, Parcel, ParcelPicture, Piece, Plc,
+    Point, Scene, Setup, SetupPlace, Sight, State, Written,
 };
 pub use server::{Listening, listen, serve};

@@ -356,3 +356,65 @@ pub struct Sight {
     /// Its cuboid as estimated so far.
     pub cuboid_px: Option<Cuboid>,
 }
+
+/// What the camera's picture shows to whoever sets it up.
+#[derive(Clone, Debug, Serialize)]
+pub struct Setup {
+    /// Number of the frame.
+    pub frame: u64,
+    /// Its time from the first frame.
+    pub t_s: f64,
+    /// Columns and rows of the camera's picture.
+    pub size_px: [usize; 2],
+    /// In the JPEG: the whole picture.
+    pub whole: Piece,
+    /// Five places, one to one, below it: the middle, then the corners, row by row.
+    pub places: Vec<SetupPlace>,
+    /// How often each sixteenth of the greys is there, as a share of the pixels.
+    pub histogram: [f32; 16],
+    /// Share of the pixels that are as white as can be, and black.
+    pub white_share: f32,
+    /// Likewise.
+    pub black_share: f32,
+    /// How far the belt moves while a frame is exposed, pixels of the belt view; `None`: the
+    /// configuration names no exposure.
+    pub motion_blur_px: Option<f64>,
+    /// The board that was looked for.
+    pub board: Option<BoardSeen>,
+}
+
+/// A part of the camera's picture in the JPEG that comes with it.
+#[derive(Clone, Copy, Debug, PartialEq, Serialize)]
+pub struct Piece {
+    /// Where it begins in the camera's picture.
+    pub from_px: [usize; 2],
+    /// Where it begins in the JPEG.
+    pub at_px: [usize; 2],
+    /// Columns and rows in the JPEG.
+    pub size_px: [usize; 2],
+    /// Pixels of the camera for each.
+    pub shrunk_by: usize,
+}
+
+/// A place of the picture.
+#[derive(Clone, Copy, Debug, Serialize)]
+pub struct SetupPlace {
+    /// Its part of the JPEG.
+    #[serde(flatten)]
+    pub piece: Piece,
+    /// Standard deviation of the blur of the edges there; `None`: there are none.
+    pub blur_px: Option<f64>,
+}
+
+/// A chessboard in the camera's picture.
+#[derive(Clone, Debug, Serialize)]
+pub struct BoardSeen {
+    /// `found`, or why it is not: `no_grid`, `another_grid`, `markers`.
+    pub found: &'static str,
+    /// Inner corners of the grid that was seen, the longer side first.
+    pub size: Option<[usize; 2]>,
+    /// Its inner corners in the camera's picture, row by row; a few may be missing.
+    pub corners_px: Vec<Px>,
+    /// The outermost of them, around it: a quadrangle that is none when the camera looks straight at it.
+    pub outline_px: Vec<Px>,
+}

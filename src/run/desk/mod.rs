@@ -12,6 +12,7 @@ mod insight;
 mod lamps;
 mod news;
 mod scene;
+mod setup;
 pub mod shots;
 mod trend;
 
@@ -24,6 +25,7 @@ use crate::config::{Config, DimensionOrder, Site};
 use crate::error::{Error, Result};
 use crate::event::ParcelRecord;
 use crate::event::clock::utc_ms;
+use crate::image::Plane;
 use crate::plc::link::Commanded;
 use crate::web::{self, Board, NoPicture, View};
 use heapless::spsc::Consumer;
@@ -132,11 +134,12 @@ impl<'a> Desk<'a> {
         let archive = config.archive.folder.as_deref();
         let bytes_max = (config.archive.mib_max as u64) << 20;
         let archive = archive.map(|folder| Archive::start(folder, bytes_max)).transpose()?;
-        let mut live = [(None, None), (None, None)];
+        let mut live = [const { (None, None) }; LIVE];
         for shot in shots {
             match shot.framing.subject {
                 Subject::Raw => live[View::Raw as usize].0 = Some(shot),
                 Subject::Belt => live[View::Belt as usize].0 = Some(shot),
+                Subject::Whole => live[View::Setup as usize].0 = Some(shot),
                 Subject::Parcel => {
                     let _ = album.spare.enqueue(shot); // invariant: there is room for all
                 }
@@ -208,7 +211,7 @@ impl<'a> Desk<'a> {
     fn ask(&mut self, now: Instant) -> Duration {
         let period = Duration::from_secs(1) / self.config.web.pictures_per_s_max.max(1);
         let mut sleep = LOOK;
-        for view in [View::Raw, View::Belt] {
+        for view in [View::Raw, View::Belt, View::Setup] {
             let (shot, asked) = &mut self.live[view as usize];
             if shot.is_none() || !self.board.is_wanted(view) {
                 continue;
@@ -232,6 +235,7 @@ impl<'a> Desk<'a> {
             match shot.framing.subject {
                 Subject::Raw => self.put_up(View::Raw, shot),
                 Subject::Belt => self.put_up(View::Belt, shot),
+                Subject::Whole => self.put_up(View::Setup, shot),
                 Subject::Parcel => {
                     tell_failure(self.keep(&shot));
                     let _ = self.album.spare.enqueue(shot); // invariant: there is room for all
@@ -241,16 +245,33 @@ impl<'a> Desk<'a> {
     }
 
     fn put_up(&mut self, view: View, shot: Shot) {
-        tell_failure(self.show(view, &shot));
+        tell_failure(match view {
+            View::Setup => self.set_up(&shot),
+            View::Raw | View::Belt => self.show(view, &shot),
+        });
         self.live[view as usize].0 = Some(shot);
     }
 
     fn show(&self, view: View, shot: &Shot) -> Result<()> {
         let scene = self.geometry.scene(shot);
-        let mut bytes = json(&scene)?.into_bytes();
-        bytes.push(b'\n');
-        encode(shot.pixels(), shot.framing.size_px, LIVE_QUALITY, &mut bytes)?;
+        let bytes = described(&scene, shot.pixels(), shot.framing.size_px)?;
         self.board.picture(view, scene.frame, bytes);
+        Ok(())
+    }
+
+    /// Show what helps to set the camera up, and keep the picture of a board for whoever wants it.
+    fn set_up(&self, shot: &Shot) -> Result<()> {
+        let Framing { size_px, time, .. } = shot.framing;
+        let picture = Plane::packed(shot.pixels(), size_px[0], size_px[1])
+            .ok_or_else(|| Error::failure("a picture of another size"))?;
+        let motion_blur_px = setup::motion_blur_px(&self.config, self.geometry.mm_per_px());
+        let (setup, size_px, pixels) =
+            setup::look(picture, time, self.board.looked_for(), motion_blur_px);
+        if setup.board.as_ref().is_some_and(|board| board.found == "found") {
+            self.board.whole(setup.frame, setup::pgm(shot.pixels(), setup.size_px));
+        }
+        let bytes = described(&setup, &pixels, size_px)?;
+        self.board.picture(View::Setup, setup.frame, bytes);
         Ok(())
     }
 
@@ -326,6 +347,14 @@ fn tell_failure(made: Result<()>) {
 
 fn json(what: &impl Serialize) -> Result<String> {
     serde_json::to_string(what).map_err(|e| Error::failure(format!("no JSON: {e}")))
+}
+
+/// A line of JSON, then the picture that it describes.
+fn described(what: &impl Serialize, pixels: &[u8], size_px: [usize; 2]) -> Result<Vec<u8>> {
+    let mut bytes = json(what)?.into_bytes();
+    bytes.push(b'\n');
+    encode(pixels, size_px, LIVE_QUALITY, &mut bytes)?;
+    Ok(bytes)
 }
 
 fn encode(pixels: &[u8], size_px: [usize; 2], quality: u8, into: &mut Vec<u8>) -> Result<()> {

@@ -35,10 +35,15 @@ impl Geometry {
         Self { camera: site.camera.clone(), view: site.view.clone(), zone, grid_mm }
     }
 
+    /// Scale of the belt view.
+    pub fn mm_per_px(&self) -> f64 {
+        self.view.mm_per_px
+    }
+
     /// A point of the belt in a shot; none where the lens does not show it.
     fn px(&self, shot: &Framing, at: BeltMm) -> Option<[f32; 2]> {
         let in_source = match shot.subject {
-            Subject::Raw => {
+            Subject::Raw | Subject::Whole => {
                 let raw = self.camera.project(Vector3::new(at.x, at.y, 0.0))?;
                 [raw.x, raw.y]
             }

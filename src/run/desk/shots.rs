@@ -14,7 +14,7 @@ use heapless::Vec;
 use heapless::spsc::{Consumer, Producer, Queue};
 
 /// Live pictures on their way: one of each kind.
-pub const LIVE: usize = 2;
+pub const LIVE: usize = 3;
 /// Pictures of single parcels on their way.
 const PARCELS: usize = 6;
 /// Frames of parcels that no shot was left for, on their way, and one.
@@ -34,11 +34,13 @@ const SIGHTS_MAX: usize = 32;
 /// What a picture is of.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub enum Subject {
-    /// The camera's picture.
+    /// The camera's picture, shrunk.
     #[default]
     Raw,
     /// The belt view.
     Belt,
+    /// The camera's picture, every pixel of it.
+    Whole,
     /// The belt view around one parcel that passes the middle of the zone.
     Parcel,
 }
@@ -116,7 +118,9 @@ pub fn wanted(site: &Site) -> bool {
 /// Memory for the shots of a site.
 pub fn plan(site: &Site, plan: &mut Plan) {
     if wanted(site) {
-        plan.add::<u8>("desk.live", LIVE * live_bytes(site), "a live picture of each kind");
+        plan.add::<u8>("desk.live", 2 * live_bytes(site), "a live picture of camera and belt");
+        let [width, height] = site.camera.image_size_px;
+        plan.add::<u8>("desk.whole", width * height, "the camera's picture, to set it up by");
         let bytes = PARCELS * PARCEL_SIDES_PX[0] * PARCEL_SIDES_PX[1];
         plan.add::<u8>(
             "desk.parcels",
@@ -131,10 +135,11 @@ pub fn shots(site: &Site, memory: &mut Memory) -> Result<std::vec::Vec<Shot>> {
     if !wanted(site) {
         return Ok(std::vec::Vec::new());
     }
-    let mut blocks = memory.take_parts("desk.live", LIVE, 0)?;
+    let mut blocks = memory.take_parts("desk.live", 2, 0)?;
+    blocks.push(memory.take("desk.whole", 0)?);
     blocks.extend(memory.take_parts("desk.parcels", PARCELS, 0)?);
-    let subjects =
-        [Subject::Raw, Subject::Belt].into_iter().chain(std::iter::repeat(Subject::Parcel));
+    let live = [Subject::Raw, Subject::Belt, Subject::Whole];
+    let subjects = live.into_iter().chain(std::iter::repeat(Subject::Parcel));
     Ok(blocks
         .into_iter()
         .zip(subjects)
@@ -166,9 +171,11 @@ impl Photographer<'_> {
     pub fn look(&mut self, pipeline: &Pipeline, raw: Plane<'_>, time: FrameTime) -> bool {
         let mut any = false;
         while let Some(mut shot) = self.asked.dequeue() {
-            let from = if shot.framing.subject == Subject::Raw { raw } else { pipeline.view() };
+            let is_whole = shot.framing.subject == Subject::Whole;
+            let from = if shot.framing.subject == Subject::Belt { pipeline.view() } else { raw };
             let size_px = [from.width(), from.height()];
-            shot.take(from, [[0, 0], size_px], factor(size_px, LIVE_SIDES_PX), time);
+            let by = if is_whole { 1 } else { factor(size_px, LIVE_SIDES_PX) };
+            shot.take(from, [[0, 0], size_px], by, time);
             for sight in pipeline.sights() {
                 let _ = shot.sights.push(sight);
             }
@@ -230,7 +237,7 @@ impl Shot {
         &self.pixels[..width * height]
     }
 
-    /// Fill it with a region, shrunk by a whole factor; what is left over at its end is not shown.
+    /// Fill it with a region, shrunk by a whole factor.
     fn take(&mut self, from: Plane<'_>, region: [[usize; 2]; 2], by: usize, time: FrameTime) {
         let [origin_px, end_px] = region;
         let size = |i: usize| ((end_px[i] - origin_px[i]) / by).max(1);
@@ -239,17 +246,20 @@ impl Shot {
         self.framing =
             Framing { subject, time, size_px: [width, height], origin_px, shrunk_by: by };
         self.sights.clear();
-        let rows = self.pixels.chunks_exact_mut(width).take(height).enumerate();
-        for (row, into) in rows {
-            let at = |k: usize| {
-                let y = (origin_px[1] + row * by + k).min(from.height() - 1);
-                &from.row(y)[origin_px[0]..end_px[0]]
-            };
-            match by {
-                1 => into.copy_from_slice(&at(0)[..width]),
-                2 => halve(at(0), at(1), into),
-                _ => thin(at(by / 2 - 1), at(by / 2), by, into),
-            }
+        shrink(from, region, by, &mut self.pixels);
+    }
+}
+
+/// A region shrunk by a whole factor, row by row; what is left over at its end is not shown.
+pub(super) fn shrink(from: Plane<'_>, region: [[usize; 2]; 2], by: usize, into: &mut [u8]) {
+    let [[x0, y0], [x1, y1]] = region;
+    let [width, height] = [((x1 - x0) / by).max(1), ((y1 - y0) / by).max(1)];
+    for (row, into) in into.chunks_exact_mut(width).take(height).enumerate() {
+        let at = |k: usize| &from.row((y0 + row * by + k).min(from.height() - 1))[x0..x1];
+        match by {
+            1 => into.copy_from_slice(&at(0)[..width]),
+            2 => halve(at(0), at(1), into),
+            _ => thin(at(by / 2 - 1), at(by / 2), by, into),
         }
     }
 }

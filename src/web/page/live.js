@@ -36,36 +36,18 @@ export function live(signal) {
     follow(round.signal);
   }
 
-  async function follow(over) {
-    let shown = "";
-    while (!over.aborted) {
-      await visible(over);
-      if (over.aborted) return;
-      try {
-        const answer = await ask(`/api/live/${options.view}${shown}`, over);
-        if (answer.status === 204) {
-          notice.textContent = t("live.none");
-          notice.hidden = false;
-          await pause(300, over);
-          continue;
-        }
-        const picture = await decoded(new Uint8Array(await answer.arrayBuffer()));
-        if (over.aborted) return;
-        newest?.bitmap.close();
-        newest = picture;
-        shown = `?after=${picture.scene.frame}`;
-        draw(canvas, picture, options);
-        notice.hidden = true;
-        figure.textContent = t("live.figure", { frame: picture.scene.frame, time: picture.scene.t_s.toFixed(2), parcels: picture.scene.parcels.filter((p) => p.phase === "riding").length });
-        canvas.dataset.frame = picture.scene.frame;
-      } catch (error) {
-        if (over.aborted) return;
-        notice.textContent = t("live.none");
-        notice.hidden = false;
-        await pause(1000, over);
-      }
-    }
-  }
+  const follow = (over) => pull((shown) => `/api/live/${options.view}${shown === null ? "" : `?after=${shown}`}`, over, (picture) => {
+    newest?.bitmap.close();
+    newest = picture;
+    const { scene } = picture;
+    draw(canvas, picture, options);
+    notice.hidden = true;
+    figure.textContent = t("live.figure", { frame: scene.frame, time: scene.t_s.toFixed(2), parcels: scene.parcels.filter((p) => p.phase === "riding").length });
+    canvas.dataset.frame = scene.frame;
+  }, () => {
+    notice.textContent = t("live.none");
+    notice.hidden = false;
+  });
   restart();
 
   return h("section", { class: "card" },
@@ -73,6 +55,32 @@ export function live(signal) {
     h("div", { class: "bar" }, choices.belt, choices.raw, toggle("grid"), toggle("parcels"), toggle("bright"), figure),
     h("div", { class: "live" }, canvas, notice),
     h("div", { class: "legend" }, ["zone", "top", "base", "candidate"].map((name) => h("span", {}, h("i", { class: name }), t(`live.legend.${name}`)))));
+}
+
+// Ask for one picture after the other, each as soon as the one before is shown; not while nobody sees
+// them. path: of the next one, by the frame that was shown last.
+export async function pull(path, over, show, miss) {
+  let shown = null;
+  while (!over.aborted) {
+    await visible(over);
+    if (over.aborted) return;
+    try {
+      const answer = await ask(path(shown), over);
+      if (answer.status === 204) {
+        miss();
+        await pause(300, over);
+        continue;
+      }
+      const picture = await decoded(new Uint8Array(await answer.arrayBuffer()));
+      if (over.aborted) return;
+      await show(picture);
+      shown = picture.scene.frame;
+    } catch (error) {
+      if (over.aborted) return;
+      miss(error);
+      await pause(1000, over);
+    }
+  }
 }
 
 // A line of JSON, then the JPEG.

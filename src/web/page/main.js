@@ -5,9 +5,10 @@ import { events } from "./events.js";
 import { overview } from "./overview.js";
 import { parcel, parcels } from "./parcels.js";
 import { plc } from "./plc.js";
+import { setup } from "./setup.js";
 import { trend } from "./trend.js";
 
-const PAGES = { overview, parcels, trend, plc, events };
+const PAGES = { overview, parcels, trend, plc, events, setup };
 // One of a list is part of it.
 const OTHERS = { parcel };
 const LIST_OF = { parcel: "parcels" };
