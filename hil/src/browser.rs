@@ -20,6 +20,9 @@ pub struct Browser {
 }
 
 /// Where files go that a page offers. A browser that finds `..` in its path waits for ever.
+///
+/// # Panics
+/// When the project's folder has gone.
 pub fn downloads() -> PathBuf {
     project().canonicalize().expect("it is there").join("target/hil-out/downloads")
 }

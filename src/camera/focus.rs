@@ -80,7 +80,9 @@ fn blurred(grey: &[f32], width: usize) -> Vec<f32> {
     let weight = |k: usize| (-0.5 * ((k as f32 - RADIUS as f32) / AGAIN_PX).powi(2)).exp();
     let mut weights: [f32; 2 * RADIUS + 1] = std::array::from_fn(weight);
     let sum: f32 = weights.iter().sum();
-    weights.iter_mut().for_each(|w| *w /= sum);
+    for weight in &mut weights {
+        *weight /= sum;
+    }
     let along = |grey: &[f32], step: usize| -> Vec<f32> {
         let mut out = vec![0.0; grey.len()];
         let reach = RADIUS * step;

@@ -109,24 +109,27 @@ async fn admit(State(hosts): State<Hosts>, request: Request, next: Next) -> Resp
     answer
 }
 
-/// A number in a query is none.
-struct NoNumber;
+/// What is wrong with a query.
+struct BadQuery(&'static str);
 
-impl From<NoNumber> for Response {
-    fn from(_: NoNumber) -> Self {
-        refusal(StatusCode::BAD_REQUEST, "a number in the query is none: write it in digits")
+const NO_NUMBER: BadQuery = BadQuery("a number in the query is none: write it in digits");
+const NO_BOARD: BadQuery = BadQuery("a board has 3 to 60 inner corners along each side");
+
+impl From<BadQuery> for Response {
+    fn from(BadQuery(text): BadQuery) -> Self {
+        refusal(StatusCode::BAD_REQUEST, text)
     }
 }
 
 /// A number in a query, as in `since=12&limit=5`.
-fn number(query: Option<&str>, name: &str) -> Result<Option<u64>, NoNumber> {
+fn number(query: Option<&str>, name: &str) -> Result<Option<u64>, BadQuery> {
     let mut pairs = query.unwrap_or_default().split('&').filter_map(|pair| pair.split_once('='));
     let Some((_, text)) = pairs.find(|(key, _)| *key == name) else { return Ok(None) };
     let is_number =
         (1..=DIGITS_MAX).contains(&text.len()) && text.bytes().all(|b| b.is_ascii_digit());
     match text.parse() {
         Ok(number) if is_number => Ok(Some(number)),
-        _ => Err(NoNumber),
+        _ => Err(NO_NUMBER),
     }
 }
 
@@ -282,14 +285,11 @@ async fn live(
 }
 
 /// Inner corners of the board to look for, as in `columns=9&rows=6`.
-fn board_sides(query: Option<&str>) -> Result<Option<[u8; 2]>, Response> {
+fn board_sides(query: Option<&str>) -> Result<Option<[u8; 2]>, BadQuery> {
     let (columns, rows) = (number(query, "columns")?, number(query, "rows")?);
     let (Some(columns), Some(rows)) = (columns, rows) else { return Ok(None) };
     let side = |n: u64| u8::try_from(n).ok().filter(|n| BOARD_SIDES.contains(n));
-    let wrong = "a board has 3 to 60 inner corners along each side";
-    let sides =
-        side(columns).zip(side(rows)).ok_or_else(|| refusal(StatusCode::BAD_REQUEST, wrong))?;
-    Ok(Some(sides.into()))
+    side(columns).zip(side(rows)).map(|sides| Some(sides.into())).ok_or(NO_BOARD)
 }
 
 /// The camera's picture of a frame that showed a board just now, every pixel of it.

@@ -72,7 +72,7 @@ pub struct Desk<'a> {
     archive: Option<Archive>,
     config: Config,
     /// Live shots that are here, and when each kind was last asked for.
-    live: [(Option<Shot>, Option<Instant>); LIVE],
+    live: Vec<(Option<Shot>, Option<Instant>)>,
     waiting: VecDeque<Waiting>,
     /// The last frames with a parcel that there was no room for a picture of.
     missed: Missed,
@@ -134,7 +134,8 @@ impl<'a> Desk<'a> {
         let archive = config.archive.folder.as_deref();
         let bytes_max = (config.archive.mib_max as u64) << 20;
         let archive = archive.map(|folder| Archive::start(folder, bytes_max)).transpose()?;
-        let mut live = [const { (None, None) }; LIVE];
+        let mut live: Vec<(Option<Shot>, Option<Instant>)> =
+            (0..LIVE).map(|_| (None, None)).collect();
         for shot in shots {
             match shot.framing.subject {
                 Subject::Raw => live[View::Raw as usize].0 = Some(shot),
