@@ -131,7 +131,10 @@ mod tests {
             for sigma_px in [0.7, 1.0, 1.5, 2.0, 3.0] {
                 let found = blur_of(&square(sigma_px, contrast, noise)).expect("edges");
                 let off_px = (found - sigma_px).abs();
-                assert!(off_px < 0.1 * sigma_px.max(1.0), "{sigma_px} px at {contrast}, noise {noise}: {found}");
+                assert!(
+                    off_px < 0.1 * sigma_px.max(1.0),
+                    "{sigma_px} px at {contrast}, noise {noise}: {found}"
+                );
             }
         }
     }
