@@ -1,14 +1,17 @@
 //! How sharp a picture is: the blur of its strongest edges, for whoever turns the lens.
 //!
 //! Source: S. Zhuo, T. Sim, "Defocus map estimation from a single image", Pattern Recognition 44 (9),
-//! 2011. An edge that is blurred once more loses the more of its gradient the sharper it was: with
-//! R the ratio of both gradients, sigma^2 = sigma_again^2 / (R^2 - 1).
+//! 2011. An edge that is blurred once more loses the more of its gradient the sharper it was. Here both
+//! gradients are of blurred pictures, as noise has none of its own there: with R the ratio of the gradient
+//! behind a blur of a to that behind one of b, sigma^2 = (b^2 - R^2 a^2) / (R^2 - 1).
 
 use crate::image::Plane;
 
-/// Standard deviation of the second blur: edges nearer to each other than three of it are mixed.
-const AGAIN_PX: f32 = 2.0;
+/// Standard deviations of both blurs: edges nearer to each other than three of the second are mixed.
+const BLURS_PX: [f32; 2] = [1.0, 2.0];
 const RADIUS: usize = 6;
+/// What is nearer to the border has no gradient.
+const BORDER: usize = RADIUS + 1;
 /// A central difference is itself a blur: the variance of a box of two pixels, px^2.
 const DIFFERENCE_VARIANCE_PX2: f32 = 4.0 / 12.0;
 /// The strongest edges have at least this share of the gradient that one pixel in 500 exceeds.
@@ -26,34 +29,36 @@ const BLUR_MAX_PX: f64 = 8.0;
 /// Standard deviation of the blur of the strongest edges of a picture, px: their median.
 ///
 /// `None` where no edge stands out, or where even the strongest are wider than 8 px. From 0.7 to 3 px
-/// it is right within a tenth, of itself or of a pixel, whichever is more; beyond that it only says which
-/// of two pictures is the sharper one.
+/// it is right within a tenth; beyond that it only says which of two pictures is the sharper one.
 pub fn blur_px(picture: Plane<'_>) -> Option<f64> {
     let [width, height] = [picture.width(), picture.height()];
-    if width.min(height) <= 2 * RADIUS + 2 {
+    if width.min(height) <= 2 * (BORDER + 1) {
         return None;
     }
-    let once: Vec<f32> =
+    let grey: Vec<f32> =
         (0..height).flat_map(|y| picture.row(y).iter().map(|&grey| f32::from(grey))).collect();
-    let again = blurred(&once, width);
+    let [once, again] = BLURS_PX.map(|blur_px| blurred(&grey, width, blur_px));
     let gradient = |grey: &[f32], i: usize| {
         let [dx, dy] = [grey[i + 1] - grey[i - 1], grey[i + width] - grey[i - width]];
         (0.5 * dx, 0.5 * dy)
     };
-    let inside = |y: usize| (y * width + RADIUS)..(y * width + width - RADIUS);
+    // So many pixels from the border.
+    let inside = |border: usize| {
+        (border..height - border)
+            .flat_map(move |y| (y * width + border)..(y * width + width - border))
+    };
     let mut strengths = vec![0.0; width * height];
-    for i in (RADIUS..height - RADIUS).flat_map(inside) {
+    for i in inside(BORDER) {
         let (dx, dy) = gradient(&once, i);
         strengths[i] = dx.hypot(dy);
     }
-    let mut ranked: Vec<f32> =
-        (RADIUS..height - RADIUS).flat_map(inside).map(|i| strengths[i]).collect();
+    let mut ranked: Vec<f32> = inside(BORDER).map(|i| strengths[i]).collect();
     let [half, last] = [ranked.len() / 2, ranked.len() - 1 - ranked.len() / STRONGEST];
     let median = *ranked.select_nth_unstable_by(half, f32::total_cmp).1;
     let strongest = *ranked.select_nth_unstable_by(last, f32::total_cmp).1;
     let strong = (STRONG_SHARE * strongest).max(OVER_MEDIAN * median).max(GRADIENT_MIN);
-    let mut variances: Vec<f32> = (RADIUS + 1..height - RADIUS - 1)
-        .flat_map(|y| inside(y).skip(1).take(width - 2 * RADIUS - 2))
+    let [once_px2, again_px2] = BLURS_PX.map(|blur_px| blur_px * blur_px);
+    let mut variances: Vec<f32> = inside(BORDER + 1)
         .filter(|&i| strengths[i] >= strong)
         .filter_map(|i| {
             let (dx, dy) = gradient(&once, i);
@@ -63,8 +68,10 @@ pub fn blur_px(picture: Plane<'_>) -> Option<f64> {
                 strengths[i] >= strengths[i - beside] && strengths[i] > strengths[i + beside];
             let (dx, dy) = gradient(&again, i);
             let ratio_squared = strengths[i].powi(2) / (dx * dx + dy * dy);
-            (is_crest && ratio_squared > 1.0)
-                .then(|| AGAIN_PX * AGAIN_PX / (ratio_squared - 1.0) - DIFFERENCE_VARIANCE_PX2)
+            (is_crest && ratio_squared > 1.0).then(|| {
+                (again_px2 - ratio_squared * once_px2) / (ratio_squared - 1.0)
+                    - DIFFERENCE_VARIANCE_PX2
+            })
         })
         .collect();
     if variances.len() < POINTS_MIN {
@@ -76,9 +83,9 @@ pub fn blur_px(picture: Plane<'_>) -> Option<f64> {
     (blur_px <= BLUR_MAX_PX).then_some(blur_px)
 }
 
-/// A picture blurred with [`AGAIN_PX`]; its border, as wide as the filter, is of no use.
-fn blurred(grey: &[f32], width: usize) -> Vec<f32> {
-    let weight = |k: usize| (-0.5 * ((k as f32 - RADIUS as f32) / AGAIN_PX).powi(2)).exp();
+/// A blurred picture; its border, as wide as the filter, is of no use.
+fn blurred(grey: &[f32], width: usize, blur_px: f32) -> Vec<f32> {
+    let weight = |k: usize| (-0.5 * ((k as f32 - RADIUS as f32) / blur_px).powi(2)).exp();
     let mut weights: [f32; 2 * RADIUS + 1] = std::array::from_fn(weight);
     let sum: f32 = weights.iter().sum();
     for weight in &mut weights {
@@ -130,11 +137,8 @@ mod tests {
         for (contrast, noise) in [(100.0, 0.0), (100.0, 2.0), (40.0, 1.0)] {
             for sigma_px in [0.7, 1.0, 1.5, 2.0, 3.0] {
                 let found = blur_of(&square(sigma_px, contrast, noise)).expect("edges");
-                let off_px = (found - sigma_px).abs();
-                assert!(
-                    off_px < 0.1 * sigma_px.max(1.0),
-                    "{sigma_px} px at {contrast}, noise {noise}: {found}"
-                );
+                let off = (found - sigma_px).abs() / sigma_px;
+                assert!(off < 0.1, "{sigma_px} px at {contrast}, noise {noise}: {found}");
             }
         }
     }
