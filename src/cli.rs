@@ -145,7 +145,16 @@ pub enum Command {
         /// Go back to the configuration before the one in force.
         #[arg(long, conflicts_with = "dir")]
         roll_back: bool,
+        /// Say what would be put in force, and change nothing.
+        #[arg(long, conflicts_with = "roll_back")]
+        check: bool,
         /// Folder to put configurations into.
+        #[arg(long, default_value = STORE)]
+        store: PathBuf,
+    },
+    /// Print the code that is good for signing in to the page once, to change things there.
+    Code {
+        /// Folder that `import` puts configurations into.
         #[arg(long, default_value = STORE)]
         store: PathBuf,
     },

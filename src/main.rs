@@ -136,14 +136,16 @@ fn dispatch(command: Command) -> Result<()> {
             };
             print(format_args!("{}", report.trim_end()))
         }
-        Command::Import { dir, store, .. } => {
+        Command::Import { dir, check, store, .. } => {
             let store = Store::new(&store);
             let report = match dir {
+                Some(dir) if check => import::check(&dir, &store)?,
                 Some(dir) => import::import(&dir, &store)?,
                 None => import::roll_back(&store)?,
             };
             print(format_args!("{}", report.trim_end()))
         }
+        Command::Code { store } => print(format_args!("{}", Store::new(&store).code()?)),
         Command::Manifest { dir, counter } => {
             print(format_args!("{}", manifest::make(&dir, counter)?))
         }

@@ -37,6 +37,11 @@ pub fn use_program(path: PathBuf) {
     let _ = PROGRAM.set(path);
 }
 
+/// The file that children are started from.
+pub fn program() -> &'static OsStr {
+    PROGRAM.get().map_or(OsStr::new(THIS_PROGRAM), |path| path.as_os_str())
+}
+
 /// In the child, before anything is read: no more memory than this, no core file.
 pub fn confine(memory_bytes: u64) -> Result<()> {
     let limits = [
@@ -82,8 +87,7 @@ impl Sandbox {
             Some(file) => file.into(),
             None => theirs.try_clone().map_err(failed)?,
         };
-        let program = PROGRAM.get().map_or(OsStr::new(THIS_PROGRAM), |path| path.as_os_str());
-        let mut child = Command::new(program)
+        let mut child = Command::new(program())
             .args([SUBCOMMAND, task])
             .env_clear()
             .stdin(input)

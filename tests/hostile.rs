@@ -200,7 +200,9 @@ fn a_chain_of_60000_values_ends_the_child_alone() {
         let _ = write!(nodes, r#"<Integer Name="N{i}"><pValue>N{}</pValue></Integer>"#, i + 1);
     }
     let error = Camera::serving(4, described(&nodes)).open();
-    assert!(error.contains("child process") && error.contains("stack"), "{error}");
+    // With Aravis its libraries have a part of the child's memory, and that ends first.
+    let is_out_of_room = error.contains("stack") || error.contains("memory allocation");
+    assert!(error.contains("child process") && is_out_of_room, "{error}");
 }
 
 #[test]

@@ -454,7 +454,8 @@ fn an_import_that_is_killed_is_old_or_new_and_its_result_is_known() {
             .filter(|name| !name.starts_with("site-"))
             .collect();
         names.sort();
-        names.retain(|name| name != "previous");
+        // One is there after the first configuration, the other once a stick was taken whole.
+        names.retain(|name| !["previous", "access.toml"].contains(&name.as_str()));
         assert_eq!(names, ["current", "import.toml", "lock", "report.txt", "trust.toml"]);
     }
     println!("not begun, applied, refused: {results:?}; {cut_off} of them ended by the next start");

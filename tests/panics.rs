@@ -116,7 +116,7 @@ fn a_page_that_panics() {
         let _ = visitor.read_to_end(&mut Vec::new());
     });
     let board = Arc::new(Board::new(0));
-    let ended = web::serve(&settings, listening, &board, Arc::new(Panicking));
+    let ended = web::serve(&settings, listening, &board, Arc::new(Panicking), None);
     unreachable!("it ended in order: {ended:?}");
 }
 

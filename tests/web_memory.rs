@@ -123,7 +123,7 @@ fn growth(careless: bool) -> usize {
     let board = Arc::new(Board::new(5));
     std::thread::scope(|scope| {
         let machine = Arc::new(Still { careless });
-        scope.spawn(|| web::serve(&settings, listening, &board, machine).expect("serves"));
+        scope.spawn(|| web::serve(&settings, listening, &board, machine, None).expect("serves"));
         // Lists are full, threads and tables are there.
         visit(server, &board, 1_000);
         let before = held();

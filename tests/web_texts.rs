@@ -12,7 +12,7 @@ fn page(name: &str) -> String {
     std::fs::read_to_string(path).expect("committed")
 }
 
-const SCRIPTS: [&str; 10] = [
+const SCRIPTS: [&str; 11] = [
     "main.js",
     "common.js",
     "live.js",
@@ -22,6 +22,7 @@ const SCRIPTS: [&str; 10] = [
     "plc.js",
     "events.js",
     "setup.js",
+    "site.js",
     "stills.js",
 ];
 
@@ -71,8 +72,17 @@ fn every_word_is_there_in_both_languages() {
         needed.insert(format!("setup.board.{name}"));
     }
     needed.extend((0..9).map(|part| format!("setup.part.{part}")));
-    for kind in ["started", "stopped", "began", "ended", "camera_lost", "command", "import"] {
+    for kind in ["started", "stopped", "began", "ended", "camera_lost", "command", "import"]
+        .into_iter()
+        .chain(["signed_in", "site_check", "site_apply", "site_go_back"])
+    {
         needed.insert(format!("event.{kind}"));
+    }
+    for name in ["check", "apply", "reset", "back", "calibrate", "backup", "sign_out"] {
+        needed.insert(format!("site.{name}"));
+    }
+    for name in ["busy", "bringing", "would", "done", "refused", "no_site"] {
+        needed.insert(format!("site.words.{name}"));
     }
     for name in SCRIPTS {
         let script = page(name);

@@ -27,6 +27,23 @@ pub fn downloads() -> PathBuf {
     project().canonicalize().expect("it is there").join("target/hil-out/downloads")
 }
 
+/// What axe finds on the page as it is: rules and the elements that break them.
+pub const BROKEN_RULES: &str = "return axe.run(document, { resultTypes: ['violations'] }).then((found) =>
+    found.violations.map((rule) => `${rule.id}: ${rule.nodes.map((node) => node.html).join(' ')}`))";
+
+/// Deque's axe, out of the Python package that `.ci/run` installs.
+///
+/// # Panics
+/// When it is not installed.
+pub fn axe() -> String {
+    let libraries = std::fs::read_dir(project().join("target/hil-venv/lib")).expect("installed");
+    let scripts = libraries.map(|python| {
+        let package = python.expect("readable").path().join("site-packages/axe_playwright_python");
+        std::fs::read_to_string(package.join("axe.min.js"))
+    });
+    scripts.into_iter().find_map(Result::ok).expect("`.ci/run` installs axe-playwright-python")
+}
+
 /// Ask the browser for what its console says; Chromium only.
 #[derive(Debug)]
 struct ConsoleLog;

@@ -1,12 +1,8 @@
 //! The page against the demo, in a real browser. Screenshots are in `target/hil-out/web`.
 
-use beltgauge::camera::CameraFile;
-use beltgauge::run::demo;
-use fantoccini::Locator;
 use hil::Demo;
-use hil::browser::{Browser, downloads};
+use hil::browser::{BROKEN_RULES, Browser, axe};
 use serde_json::{Value, json};
-use std::process::Command;
 
 /// A thing on the page that is there and shows something.
 const TEXT: &str = "return document.querySelector('main').innerText.length > 50";
@@ -158,107 +154,6 @@ async fn the_page_shows_pictures_and_parcels_in_both_languages_and_its_console_i
     browser.end().await;
 }
 
-/// Frames a second of the demo.
-const FPS: u32 = 30;
-
-/// Choose what stills are kept for.
-async fn keep_stills(browser: &Browser, folder: &str) {
-    browser
-        .run(&format!(
-            "const choice = document.querySelector('main select'); choice.value = '{folder}';
-             choice.dispatchEvent(new Event('change'))"
-        ))
-        .await;
-}
-
-#[tokio::test(flavor = "multi_thread")]
-async fn a_camera_is_set_up_by_the_page_and_its_stills_calibrate_it() {
-    let demo = Demo::start_with("web-setup", 600, false, &["--board"]);
-    let _ = std::fs::remove_dir_all(downloads());
-    let browser = Browser::start([1400, 1100]).await;
-    browser.client.goto(&format!("http://{}/#setup", demo.page)).await.expect("it opens");
-    let frame = "return document.getElementById('setup')?.dataset.frame ?? null";
-    browser.wait("a picture", frame).await;
-    // Somewhere in it the board is, with sharp edges: the demo's camera blurs by half a pixel.
-    let best = "return [...document.querySelectorAll('.places figcaption b')]
-        .map((figure) => parseFloat(figure.textContent)).find((blur) => blur < 0.8) ?? null";
-    browser.wait("a sharp place", best).await;
-
-    // With nothing asked for nothing is kept.
-    let kept = "Number(document.querySelector('[data-stills]').dataset.stills)";
-    assert_eq!(browser.run(&format!("return {kept}")).await, json!(0));
-    keep_stills(&browser, "lens").await;
-    // Each is shown for a second; those of the board on the belt serve as well.
-    browser.wait("stills of the lens", &format!("return {kept} >= 12")).await;
-    browser.screenshot(&demo.out.join("setup.png")).await;
-    // They survive that the page is loaded again.
-    browser.client.refresh().await.expect("it opens again");
-    browser.wait("a picture", frame).await;
-    keep_stills(&browser, "lens").await;
-    browser.wait("the same stills", &format!("return {kept} >= 12")).await;
-    keep_stills(&browser, "belt").await;
-    // Only where somebody says so: after 15 that are held come four where the belt has carried it.
-    for place in 0..4 {
-        let there = format!(
-            "const frame = Number(document.getElementById('setup').dataset.frame);
-             return Math.floor(frame / {FPS}) % 19 === {} && frame % {FPS} < {FPS} / 2",
-            15 + place
-        );
-        browser.wait("the board on the belt", &there).await;
-        browser.run("document.getElementById('board-keep').click()").await;
-        let taken = format!("return {kept} === {}", place + 1);
-        browser.wait("a still of the belt", &taken).await;
-    }
-    browser.screenshot(&demo.out.join("setup-belt.png")).await;
-    // A click of a person: no file is taken from a page that offers it by itself.
-    let save = browser.client.find(Locator::Id("board-save")).await.expect("a button");
-    save.click().await.expect("clicked");
-    let file = downloads().join("beltgauge-stills.tar");
-    hil::wait_for("the download", || file.exists().then_some(()));
-    let console = browser.console().await;
-    assert!(console.is_empty(), "{console:#?}");
-    browser.end().await;
-
-    // As a technician at a computer: the archive is a folder that `calibrate` takes.
-    let status = Command::new("tar").arg("-xf").arg(&file).arg("-C").arg(downloads()).status();
-    assert!(status.expect("tar is installed").success());
-    let stick = downloads().join("beltgauge");
-    let settings = std::fs::read_to_string(stick.join("calibration.toml")).expect("it is there");
-    assert!(settings.starts_with("board = [9, 6]\nsquare_mm = 25\n"), "{settings}");
-    let calibrate = |what: &str, more: &[&str]| {
-        let calibrated = Command::new(hil::beltgauge())
-            .args(["calibrate", what])
-            .arg(stick.join(what))
-            .args(["--board", "9x6", "--square-mm", "25"])
-            .args(more)
-            .current_dir(&stick)
-            .output()
-            .expect("it runs");
-        let words = String::from_utf8_lossy(&calibrated.stdout).into_owned();
-        println!("{words}");
-        let error = String::from_utf8_lossy(&calibrated.stderr);
-        assert!(calibrated.status.success(), "{words}{error}");
-    };
-    calibrate("lens", &["--out", "lens.toml"]);
-    calibrate(
-        "belt",
-        &["--board-thickness-mm", "3", "--lens", "lens.toml", "--out", "camera.toml"],
-    );
-
-    // The demo's camera, within what the reports say of themselves (three sigmas: 0.6 px and 1.5 mm).
-    let camera = CameraFile::load(&stick.join("camera.toml")).expect("written");
-    let truth = demo::scenario().and_then(|scenario| scenario.camera()).expect("committed");
-    let off = |i: usize| camera.lens.parameters()[i] - truth.lens.parameters()[i];
-    let lens_off_px = [0, 1, 2, 3].map(off);
-    assert!(lens_off_px.iter().all(|px| px.abs() < 0.6), "{lens_off_px:?}");
-    let height_off_mm = camera.centre_in_belt().z - truth.centre_in_belt().z;
-    assert!(height_off_mm.abs() < 1.5, "{height_off_mm}");
-}
-
-/// What axe finds on the page as it is: rules and the elements that break them.
-const BROKEN_RULES: &str = "return axe.run(document, { resultTypes: ['violations'] }).then((found) =>
-    found.violations.map((rule) => `${rule.id}: ${rule.nodes.map((node) => node.html).join(' ')}`))";
-
 #[tokio::test(flavor = "multi_thread")]
 async fn every_page_keeps_the_rules_of_accessibility_and_is_reached_by_keyboard() {
     let demo = Demo::start("web-axe", 600, false);
@@ -271,9 +166,10 @@ async fn every_page_keeps_the_rules_of_accessibility_and_is_reached_by_keyboard(
         browser.run("document.getElementById('theme').click()").await;
         let shown = format!("return document.documentElement.dataset.theme === '{theme}'");
         browser.wait(theme, &shown).await;
-        for name in ["overview", "parcels", "trend", "plc", "events", "setup"] {
+        for name in ["overview", "parcels", "trend", "plc", "events", "setup", "site"] {
             browser.run(&format!("location.hash = '#{name}'")).await;
-            browser.wait(name, "return document.querySelector('canvas, tbody tr') !== null").await;
+            let shown = "return document.querySelector('canvas, tbody tr, #site .card') !== null";
+            browser.wait(name, shown).await;
             assert_eq!(browser.run(BROKEN_RULES).await, json!([]), "{name}, {theme}");
         }
         browser.run("location.hash = '#parcels'").await;
@@ -312,17 +208,6 @@ async fn beyond_the_keyboard(browser: &Browser) -> Value {
     let left = "return [...document.querySelectorAll('a, button:not(td button), select, input')].filter(
         (one) => one.checkVisibility() && !one.disabled && !one.dataset.reached).map((one) => one.outerHTML)";
     browser.run(left).await
-}
-
-/// Deque's axe, out of the Python package that `.ci/run` installs.
-fn axe() -> String {
-    let libraries =
-        std::fs::read_dir(hil::project().join("target/hil-venv/lib")).expect("installed");
-    let scripts = libraries.map(|python| {
-        let package = python.expect("readable").path().join("site-packages/axe_playwright_python");
-        std::fs::read_to_string(package.join("axe.min.js"))
-    });
-    scripts.into_iter().find_map(Result::ok).expect("`.ci/run` installs axe-playwright-python")
 }
 
 /// Every text that the machine tells begins with markup: names of cameras, sticks and interfaces, paths,

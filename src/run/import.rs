@@ -8,8 +8,8 @@ use crate::error::{Error, Result};
 use crate::source::check_interface;
 use crate::store::manifest::MANIFEST;
 use crate::store::stick::{
-    BELT_FOLDER, FILE_BYTES_MAX, LENS_FOLDER, STILLS_BYTES_MAX, STILLS_MAX, Stick, TEXT_BYTES_MAX,
-    is_plain_name,
+    BELT_FOLDER, CODE, FILE_BYTES_MAX, LENS_FOLDER, STILLS_BYTES_MAX, STILLS_MAX, Stick,
+    TEXT_BYTES_MAX, is_plain_name,
 };
 use crate::store::{CONFIG_FILE, Locked, REPORT, Store, Trust, files};
 use serde::Deserialize;
@@ -91,10 +91,37 @@ pub fn import(root: &Path, store: &Store) -> Result<String> {
         }
     }
     stick.leave(REPORT, report.text.as_bytes());
+    if result.is_ok() {
+        leave_code(&stick, store);
+    }
     for (name, bytes) in &report.results {
         stick.leave_result(name, bytes);
     }
     result.map(|()| report.text)
+}
+
+/// Say what [`import`] would do, and do nothing: neither the store nor the stick is changed.
+pub fn check(root: &Path, store: &Store) -> Result<String> {
+    let mut stick = Stick::open(root)?;
+    let locked = store.lock()?;
+    let mut report = Report::default();
+    let staged = stage(&mut stick, &locked, &mut report);
+    let discarded = locked.discard();
+    staged?;
+    discarded.map(|()| format!("{}It would be taken.\n", report.text))
+}
+
+/// Whoever brought what was taken may change things through the page too. The report has no code: it is
+/// kept where others read it.
+fn leave_code(stick: &Stick, store: &Store) {
+    match store.code() {
+        Ok(code) => {
+            let text =
+                format!("To change things on the page, sign in with: {code}\nIt is good once.\n");
+            stick.leave(CODE, text.as_bytes());
+        }
+        Err(e) => tracing::warn!("{e}"),
+    }
 }
 
 /// What an import tells.

@@ -1,6 +1,6 @@
 //! `beltgauge run`: the appliance on a live camera, until it is told to stop.
 
-use super::{Appliance, ImportBoard, Progress, Watchdog, log, memory, syslog};
+use super::{Appliance, ImportBoard, Keeper, Progress, Watchdog, log, memory, syslog};
 use crate::config::{Can, Site};
 use crate::error::{Error, Result};
 use crate::event::ParcelRecord;
@@ -65,7 +65,14 @@ pub fn run(options: &Options<'_>) -> Result<()> {
     };
     let listen = site.config.modbus.listen;
     let watchdog = Watchdog::new(options.watchdog)?;
-    let (appliance, imports) = Appliance::new(site)?.supervised(watchdog);
+    let (mut appliance, imports) = Appliance::new(site)?.supervised(watchdog);
+    if options.config.is_none() {
+        match Keeper::new(store.clone(), Arc::clone(&stop)) {
+            Ok(keeper) => appliance = appliance.kept_by(Arc::new(keeper)),
+            // A disk that is full or read-only is no reason not to measure.
+            Err(e) => tracing::warn!("nothing can be changed through the page: {e}"),
+        }
+    }
     tracing::info!("measuring; Modbus TCP on {listen}");
     let seen_last = Arc::<Mutex<Progress>>::default();
     let housekeeping = Housekeeping {

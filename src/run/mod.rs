@@ -14,6 +14,7 @@ mod desk;
 mod explain;
 pub mod fleet;
 pub mod import;
+mod keeper;
 pub mod live;
 pub mod log;
 mod memory;
@@ -28,5 +29,6 @@ mod watchdog;
 
 pub use annotate::Annotator;
 pub use appliance::{Appliance, ImportBoard, Progress};
+pub use keeper::Keeper;
 pub use memory::{build, plan};
 pub use watchdog::{Watchdog, end_on_panic};

@@ -1,5 +1,6 @@
 //! What changes the store: one import at a time, each of them old or new after a power cut.
 
+use super::access::ACCESS;
 use super::stick::TEXT_BYTES_MAX;
 use super::{
     CURRENT, IMPORT, ImportRecord, ImportResult, Imports, REPORT, Store, TRUST, Trust, UnderWay,
@@ -14,7 +15,7 @@ use std::fs::{self, File};
 use std::os::unix::fs::MetadataExt;
 use std::path::PathBuf;
 
-const PREVIOUS: &str = "previous";
+pub(super) const PREVIOUS: &str = "previous";
 const SITE: &str = "site-";
 const STAGING: &str = "staging";
 const CUT_OFF: &str = "The import was cut off; the configuration before stays in force.\n\
@@ -78,6 +79,11 @@ impl<'a> Locked<'a> {
     /// Note that an import begins.
     pub fn begin(&self) -> Result<()> {
         self.note_under_way(UnderWay::default())
+    }
+
+    /// Leave nothing of what was staged.
+    pub fn discard(&self) -> Result<()> {
+        files::remove(&self.path(STAGING)).map_err(|e| self.store.failed(&e))
     }
 
     /// An empty folder to put a configuration into.
@@ -245,7 +251,7 @@ impl<'a> Locked<'a> {
                 files::remove(&path)?;
             }
         }
-        for name in [CURRENT, PREVIOUS, IMPORT, TRUST, REPORT] {
+        for name in [CURRENT, PREVIOUS, IMPORT, TRUST, REPORT, ACCESS] {
             files::remove(&self.path(&format!("{name}.{}", files::NEW)))?;
         }
         Ok(())

@@ -9,12 +9,24 @@ use std::path::{Path, PathBuf};
 
 /// What a file or link is called until it takes its place.
 pub const NEW: &str = "new";
+/// Who may read a file that is made: everybody, or its owner alone.
+const PUBLIC: u32 = 0o644;
+const PRIVATE: u32 = 0o600;
 
 /// Replace a file in one step: a power cut leaves the old one or the new one, whole and on the disk.
 /// An error leaves the old one.
 pub fn replace(path: &Path, bytes: &[u8]) -> io::Result<()> {
+    replace_as(PUBLIC, path, bytes)
+}
+
+/// The same of a file that nobody but its owner may read.
+pub fn replace_private(path: &Path, bytes: &[u8]) -> io::Result<()> {
+    replace_as(PRIVATE, path, bytes)
+}
+
+fn replace_as(mode: u32, path: &Path, bytes: &[u8]) -> io::Result<()> {
     let new = beside(path)?;
-    let written = create(rustix::fs::CWD, &new, bytes)
+    let written = create_as(mode, rustix::fs::CWD, &new, bytes)
         .and_then(|file| file.sync_all())
         .and_then(|()| fs::rename(&new, path));
     if written.is_err() {
@@ -43,9 +55,13 @@ fn beside(path: &Path) -> io::Result<PathBuf> {
 /// Write a new file. Never through a link; a file that was there is taken away.
 /// On an error there is none, rather than half of one.
 pub fn create(folder: impl AsFd, name: &Path, bytes: &[u8]) -> io::Result<File> {
+    create_as(PUBLIC, folder, name, bytes)
+}
+
+fn create_as(mode: u32, folder: impl AsFd, name: &Path, bytes: &[u8]) -> io::Result<File> {
     let flags = OFlags::WRONLY | OFlags::CREATE | OFlags::EXCL | OFlags::CLOEXEC;
     let _ = unlinkat(&folder, name, AtFlags::empty());
-    let mut file = File::from(openat(&folder, name, flags, Mode::from_raw_mode(0o644))?);
+    let mut file = File::from(openat(&folder, name, flags, Mode::from_raw_mode(mode))?);
     let written = file.write_all(bytes);
     if written.is_err() {
         let _ = unlinkat(&folder, name, AtFlags::empty());
@@ -128,6 +144,17 @@ mod tests {
         symlink(&victim, folder.join("link")).expect("room");
         replace(&folder.join("link"), b"5").expect("the link itself is replaced");
         assert_eq!(fs::read(&victim).expect("there"), b"untouched");
+    }
+
+    #[test]
+    fn a_private_file_is_its_owners_alone() {
+        use std::os::unix::fs::PermissionsExt;
+        let path = folder("private").join("file");
+        for _ in 0..2 {
+            replace_private(&path, b"1").expect("room");
+            let mode = fs::metadata(&path).expect("there").permissions().mode();
+            assert_eq!(mode & 0o077, 0);
+        }
     }
 
     #[test]

@@ -7,17 +7,20 @@
 //!       trust.toml                the key in force, the highest counter taken with each key
 //!       import.toml, report.txt   what the last import came to
 //!       plc.state                 what the PLC was told
+//!       access.toml               who may change all this through the page
 //! ```
 //! A configuration is written, brought to the disk and checked before one rename of a link puts it in
 //! force. What belongs to it is noted before, in `import.toml`: whoever comes next after a power cut
 //! completes an import whose link was renamed, and takes back one whose link was not.
 
+mod access;
 mod change;
 pub mod files;
 pub mod manifest;
 pub mod stick;
 mod trust;
 
+pub use access::Session;
 pub use change::Locked;
 pub use trust::Trust;
 
@@ -122,6 +125,26 @@ impl Store {
     /// A file beside the configuration in force, if it is there and plain.
     pub fn file_in_force(&self, name: &Path) -> Option<Vec<u8>> {
         files::read(&self.root.join(CURRENT).join(name), TEXT_BYTES_MAX).ok()
+    }
+
+    /// The folder in force, by name: another one after every change.
+    pub fn in_force(&self) -> Option<PathBuf> {
+        fs::read_link(self.root.join(CURRENT)).ok()
+    }
+
+    /// Whether there is a configuration to go back to.
+    pub fn can_go_back(&self) -> bool {
+        fs::read_link(self.root.join(change::PREVIOUS)).is_ok()
+    }
+
+    /// What the last import came to, in words.
+    pub fn last_report(&self) -> String {
+        text_of(&self.root.join(REPORT)).unwrap_or_default()
+    }
+
+    /// Its folder.
+    pub fn root(&self) -> &Path {
+        &self.root
     }
 
     /// Where what the PLC was told is kept, whatever the configuration.

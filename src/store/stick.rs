@@ -22,6 +22,8 @@ pub const LENS_FOLDER: &str = "lens";
 pub const BELT_FOLDER: &str = "belt";
 /// Name of the report on an update.
 pub const UPDATE_REPORT: &str = "update.txt";
+/// Name of the file with the code for the page.
+pub const CODE: &str = "code.txt";
 /// Largest text file.
 pub const TEXT_BYTES_MAX: u64 = 256 << 10;
 /// Largest file at all: a still or a system.
@@ -35,7 +37,7 @@ const ENTRIES_MAX: usize = 1000;
 /// Most names that a report lists.
 const NAMES_TOLD: usize = 12;
 /// Files that are no part of a set: what the appliance leaves, and the manifest itself.
-const NO_PART: [&str; 4] = [REPORT, UPDATE_REPORT, MANIFEST, SIGNATURE];
+const NO_PART: [&str; 5] = [REPORT, UPDATE_REPORT, CODE, MANIFEST, SIGNATURE];
 /// How folders are opened; never through a link.
 const FOLDER_FLAGS: OFlags =
     OFlags::RDONLY.union(OFlags::DIRECTORY).union(OFlags::CLOEXEC).union(OFlags::NOFOLLOW);

@@ -3,9 +3,10 @@
 use super::assets::ASSETS;
 use super::board::{Board, PARCELS_MAX, View};
 use super::bundle::{self, Packing};
+use super::change;
 use super::guard::{self, Hosts};
 use super::metrics;
-use super::model::{Archived, BundleFile, Event, Machine, Parcel, Point};
+use super::model::{Archived, BundleFile, Event, Keeper, Machine, Parcel, Point};
 use crate::config::Web as Settings;
 use crate::event::csv;
 use axum::body::Body;
@@ -19,7 +20,7 @@ use serde::Serialize;
 use std::borrow::Borrow;
 use std::sync::Arc;
 use std::time::Duration;
-use tokio::sync::Semaphore;
+use tokio::sync::{Mutex, Semaphore};
 
 /// A request for a live picture waits this long for one that is due.
 const PICTURE_PATIENCE: Duration = Duration::from_secs(1);
@@ -41,17 +42,27 @@ fn patience(settings: &Settings) -> Duration {
 
 /// What the answers are made from.
 #[derive(Clone)]
-struct Sources {
+pub(super) struct Sources {
     patience: Duration,
-    board: Arc<Board>,
+    pub(super) board: Arc<Board>,
     machine: Arc<dyn Machine>,
+    /// None: nothing can be changed.
+    pub(super) keeper: Option<Arc<dyn Keeper>>,
+    /// One code is tried at a time, and one file taken.
+    pub(super) sign_ins: Arc<Mutex<()>>,
+    pub(super) files: Arc<Mutex<()>>,
     questions: Arc<Semaphore>,
     bundles: Arc<Semaphore>,
 }
 
 /// All that is served; so many questions at most may wait for the disk as there are visitors.
-pub(super) fn router(board: Arc<Board>, machine: Arc<dyn Machine>, settings: &Settings) -> Router {
-    let hosts = Hosts::new(settings);
+pub(super) fn router(
+    board: Arc<Board>,
+    machine: Arc<dyn Machine>,
+    keeper: Option<Arc<dyn Keeper>>,
+    settings: &Settings,
+) -> Router {
+    let gate = Gate { hosts: Hosts::new(settings), is_closed: keeper.is_none() };
     // A visitor asks one question at a time.
     let questions = Arc::new(Semaphore::new(settings.connections_max));
     let bundles = Arc::new(Semaphore::new(BUNDLES_MAX));
@@ -76,8 +87,26 @@ pub(super) fn router(board: Arc<Board>, machine: Arc<dyn Machine>, settings: &Se
         .route("/api/bundle.tar.gz", get(bundle))
         .route("/metrics", get(metrics))
         .fallback(|| async { refusal(StatusCode::NOT_FOUND, "there is no such page") })
-        .layer(middleware::from_fn_with_state(hosts, admit))
-        .with_state(Sources { patience, board, machine, questions, bundles })
+        .merge(change::routes())
+        .layer(middleware::from_fn_with_state(gate, admit))
+        .with_state(Sources {
+            patience,
+            board,
+            machine,
+            keeper,
+            sign_ins: Arc::default(),
+            files: Arc::default(),
+            questions,
+            bundles,
+        })
+}
+
+/// What is asked of every request.
+#[derive(Clone)]
+struct Gate {
+    hosts: Hosts,
+    /// Nothing can be changed.
+    is_closed: bool,
 }
 
 /// For visitors whom `web.allow` does not name: nothing but why.
@@ -96,12 +125,15 @@ fn refusal(status: StatusCode, text: &'static str) -> Response {
 }
 
 /// Turn away who may not ask, and tell browsers what they may do with the answer.
-async fn admit(State(hosts): State<Hosts>, request: Request, next: Next) -> Response {
-    let mut answer = if !hosts.admit(&request) {
+async fn admit(State(gate): State<Gate>, request: Request, next: Next) -> Response {
+    let only_reads = matches!(*request.method(), Method::GET | Method::HEAD);
+    let mut answer = if !gate.hosts.admit(&request) {
         let text = "this machine is not called so: ask for it by its address, or put the name into web.hosts";
         refusal(StatusCode::MISDIRECTED_REQUEST, text)
-    } else if !matches!(*request.method(), Method::GET | Method::HEAD) {
+    } else if !only_reads && gate.is_closed {
         refusal(StatusCode::METHOD_NOT_ALLOWED, "nothing can be changed here: only GET is answered")
+    } else if !only_reads && !change::is_own_page(request.headers()) {
+        refusal(StatusCode::FORBIDDEN, "only this machine's own page can change anything")
     } else {
         next.run(request).await
     };

@@ -22,6 +22,7 @@ pub(super) const ASSETS: &[(&str, &str, &[u8])] = &[
     ("/events.js", SCRIPT, include_bytes!("page/events.js")),
     ("/trend.js", SCRIPT, include_bytes!("page/trend.js")),
     ("/setup.js", SCRIPT, include_bytes!("page/setup.js")),
+    ("/site.js", SCRIPT, include_bytes!("page/site.js")),
     ("/stills.js", SCRIPT, include_bytes!("page/stills.js")),
     // As it is published: https://github.com/leeoniya/uPlot, version 1.6.32.
     ("/uplot.js", SCRIPT, include_bytes!("page/uplot/uPlot.iife.min.js")),

@@ -14,6 +14,8 @@ pub const PARCELS_MAX: usize = 200;
 pub const EVENTS_MAX: usize = 300;
 /// The same of the trend: eight hours, a shift, in pieces of ten seconds.
 pub const POINTS_MAX: usize = 2880;
+/// Events of visitors that wait for the desk.
+const NOTES_MAX: usize = 32;
 /// A live picture that is older shows something else by now.
 const FRESH: Duration = Duration::from_millis(300);
 
@@ -51,6 +53,7 @@ pub struct Board {
     started_ms: u64,
     parcels: Mutex<VecDeque<(Arc<Parcel>, axum::body::Bytes)>>,
     events: Mutex<VecDeque<Arc<Event>>>,
+    notes: Mutex<VecDeque<Event>>,
     points: Mutex<VecDeque<Point>>,
     parcels_told: AtomicU64,
     events_told: AtomicU64,
@@ -77,6 +80,7 @@ impl Board {
             started_ms,
             parcels: Mutex::default(),
             events: Mutex::default(),
+            notes: Mutex::default(),
             points: Mutex::new(VecDeque::with_capacity(POINTS_MAX)),
             parcels_told: AtomicU64::new(0),
             events_told: AtomicU64::new(0),
@@ -113,6 +117,16 @@ impl Board {
         let event = Arc::new(event);
         put(&mut lock(&self.events), EVENTS_MAX, Arc::clone(&event));
         event
+    }
+
+    /// What a visitor did, for whoever puts up events and keeps them.
+    pub fn note(&self, event: Event) {
+        put(&mut lock(&self.notes), NOTES_MAX, event);
+    }
+
+    /// What visitors did since this was asked last.
+    pub fn take_notes(&self) -> VecDeque<Event> {
+        std::mem::take(&mut *lock(&self.notes))
     }
 
     /// Put up a piece of the trend; it gets its number.

@@ -25,6 +25,92 @@ pub trait Machine: Send + Sync + 'static {
     fn bundle(&self) -> BundleFiles;
 }
 
+/// Changes the machine's site, for whoever has signed in. Everything but [`Keeper::is_signed_in`] may wait
+/// for the disk; errors are words for the visitor.
+pub trait Keeper: Send + Sync + 'static {
+    /// Sign in with the one-time code: the secret that the visitor is known by from then on. `None`: it is
+    /// another code.
+    fn sign_in(&self, code: &str) -> Result<Option<String>, String>;
+    /// Whether whoever has this secret has signed in.
+    fn is_signed_in(&self, secret: &str) -> bool;
+    /// Sign out whoever has signed in.
+    fn sign_out(&self) -> Result<(), String>;
+    /// The site in force.
+    fn site(&self) -> Site;
+    /// Empty the tray: the files that the visitor brings, as on a stick.
+    fn clear(&self) -> Result<(), String>;
+    /// Put a file on the tray.
+    fn put(&self, path: &str, bytes: &[u8]) -> Result<(), String>;
+    /// Begin a change; [`Site::work`] says how it goes.
+    fn change(&self, change: Change) -> Result<(), String>;
+}
+
+/// What a visitor who has signed in can have done.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize)]
+#[serde(rename_all = "snake_case")]
+pub enum Change {
+    /// Say what putting the tray in force would do.
+    Check,
+    /// Put what is on the tray in force.
+    Apply,
+    /// Put the site before in force again.
+    GoBack,
+}
+
+/// How far a change has come.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize)]
+#[serde(rename_all = "snake_case")]
+pub enum WorkState {
+    /// There was none since start.
+    #[default]
+    None,
+    /// It is at work.
+    Busy,
+    /// It is done.
+    Good,
+    /// It was refused, or has failed.
+    Bad,
+}
+
+/// A change, since start.
+#[derive(Clone, Debug, Default, Serialize)]
+pub struct Work {
+    /// Which.
+    pub change: Option<Change>,
+    /// How far it has come.
+    pub state: WorkState,
+    /// What it came to, in words.
+    pub report: String,
+    /// Another site is in force: the program starts again.
+    pub restarts: bool,
+}
+
+/// A text file of the site.
+#[derive(Clone, Debug, Serialize)]
+pub struct SiteFile {
+    /// Its name, beside the configuration.
+    pub name: String,
+    /// What is in it.
+    pub text: String,
+}
+
+/// The site in force.
+#[derive(Clone, Debug, Default, Serialize)]
+pub struct Site {
+    /// Its configuration, as it was written.
+    pub configuration: Option<String>,
+    /// The camera file that it names.
+    pub camera: Option<SiteFile>,
+    /// There is one before it.
+    pub can_go_back: bool,
+    /// Imports so far, from sticks and through the page; wraps.
+    pub imports: u16,
+    /// What the last one came to, in words.
+    pub report: String,
+    /// The last change through the page, since start.
+    pub work: Work,
+}
+
 /// Files of the support bundle, one after the other.
 pub type BundleFiles = Box<dyn Iterator<Item = BundleFile> + Send>;
 
@@ -221,7 +307,7 @@ pub struct Event {
     /// When, ms since 1970.
     pub utc_ms: u64,
     /// What: `started`, `stopped`, `began` and `ended` (of the reason `code`), `camera_lost`, `command`,
-    /// `import`.
+    /// `import`, `signed_in`, `site_check`, `site_apply`, `site_go_back`.
     pub kind: &'static str,
     /// Which.
     pub code: u32,

@@ -3,9 +3,10 @@
 use super::api;
 use super::board::Board;
 use super::guard::{Doorkeeper, Visit};
-use super::model::Machine;
+use super::model::{Keeper, Machine};
 use crate::config::Web as Settings;
 use crate::error::{Error, Result};
+use axum::Extension;
 use hyper::server::conn::http1;
 use hyper_util::rt::{TokioIo, TokioTimer};
 use hyper_util::service::TowerToHyperService;
@@ -52,6 +53,7 @@ pub fn serve(
     listening: Listening,
     board: &Arc<Board>,
     machine: Arc<dyn Machine>,
+    keeper: Option<Arc<dyn Keeper>>,
 ) -> Result<()> {
     let failed = |e: std::io::Error| Error::failure(format!("the web server failed: {e}"));
     let runtime = tokio::runtime::Builder::new_current_thread()
@@ -63,7 +65,7 @@ pub fn serve(
         .map_err(failed)?;
     runtime.block_on(async {
         tokio::select! {
-            () = accept(settings, listening, board, machine) => {}
+            () = accept(settings, listening, board, machine, keeper) => {}
             () = board.closed() => {}
         }
     });
@@ -105,10 +107,11 @@ async fn accept(
     listening: Listening,
     board: &Arc<Board>,
     machine: Arc<dyn Machine>,
+    keeper: Option<Arc<dyn Keeper>>,
 ) {
     let listener = patiently(settings, listening).await;
     let door = Doorkeeper::new(settings.connections_max);
-    let router = api::router(Arc::clone(board), machine, settings);
+    let router = api::router(Arc::clone(board), machine, keeper, settings);
     loop {
         match listener.accept().await {
             Ok((stream, address)) => {
@@ -116,6 +119,7 @@ async fn accept(
                 if let Some(visit) = door.admit(address.ip()) {
                     let admitted = settings.admits(address.ip());
                     let router = if admitted { router.clone() } else { api::closed() };
+                    let router = router.layer(Extension(address.ip().to_canonical()));
                     tokio::spawn(receive(stream, visit, router));
                 }
             }

@@ -1,6 +1,7 @@
 //! What several tests share: the command, scratch folders and the shared data.
 #![allow(dead_code)] // each test uses its part
 
+pub mod page;
 pub mod truth;
 
 use beltgauge::config::Site;

@@ -88,6 +88,7 @@ pub struct Appliance {
     imports: ImportBoard,
     watchdog: Watchdog,
     page: Option<web::Listening>,
+    keeper: Option<Arc<dyn web::Keeper>>,
 }
 
 /// What the threads share.
@@ -193,7 +194,14 @@ impl Appliance {
         let (imports, watchdog) = (ImportBoard::default(), Watchdog::default());
         // An address that is taken is no reason not to measure: it is told, and tried again.
         let page = site.config.web.enabled.then(|| web::listen(&site.config.web));
-        Ok(Self { site, listener, journal, imports, watchdog, page })
+        Ok(Self { site, listener, journal, imports, watchdog, page, keeper: None })
+    }
+
+    /// Let whoever signs in to the page change the site.
+    #[must_use]
+    pub fn kept_by(mut self, keeper: Arc<dyn web::Keeper>) -> Self {
+        self.keeper = Some(keeper);
+        self
     }
 
     /// Where the page is served, if it is.
@@ -222,7 +230,7 @@ impl Appliance {
         let clients = ClientList::new(config.modbus.connections_max);
         let (papers, room) = (Papers::of(&self.site)?, clients.room());
         let insight = Arc::new(Insight::new(config.clone(), papers, feed.size_px(), room));
-        let (page, board) = (self.page, desk::board());
+        let (page, keeper, board) = (self.page, self.keeper, desk::board());
         let encoder = encoder(&config);
         let Carved { buffers, pipeline, shots } = super::memory::carve(self.site)?;
         realtime::lock_memory(&config.realtime)?;
@@ -272,7 +280,7 @@ impl Appliance {
                 };
                 services.push(spawn_service(scope, "desk", shared, desk)?);
             }
-            services.extend(spawn_page(scope, config, page, (&board, &insight), shared)?);
+            services.extend(spawn_page(scope, config, page, (&board, &insight, keeper), shared)?);
             services.extend(spawn_fleet(scope, config, &insight, shared)?);
             let vision = Vision {
                 pipeline,
@@ -385,12 +393,12 @@ fn spawn_page<'scope>(
     scope: &'scope std::thread::Scope<'scope, '_>,
     config: &'scope Config,
     page: Option<web::Listening>,
-    (board, insight): (&Arc<Board>, &Arc<Insight>),
+    (board, insight, keeper): (&Arc<Board>, &Arc<Insight>, Option<Arc<dyn web::Keeper>>),
     shared: &'scope Shared,
 ) -> Result<Option<Handle<'scope>>> {
     let Some(page) = page else { return Ok(None) };
     let (insight, board) = (Arc::clone(insight), Arc::clone(board));
-    let web = move || web::serve(&config.web, page, &board, insight);
+    let web = move || web::serve(&config.web, page, &board, insight, keeper);
     spawn_service(scope, "web", shared, web).map(Some)
 }
 

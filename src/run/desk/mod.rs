@@ -183,6 +183,9 @@ impl<'a> Desk<'a> {
             while started && let Some(given) = self.commanded.dequeue() {
                 self.happened(news::command(utc_ms(), &given));
             }
+            for event in self.board.take_notes() {
+                self.happened(event);
+            }
             let now = Instant::now();
             if over || self.looked.is_none_or(|at| now - at >= NEWS) {
                 self.looked = Some(now);

@@ -84,6 +84,14 @@ export async function ask(path, signal) {
   if (!answer.ok) throw new Error(await answer.text());
   return answer;
 }
+
+// Change something, or ask what only who has signed in may know.
+export async function send(method, path, token, body = null, signal = null) {
+  const headers = token ? { "X-Beltgauge-Token": token } : {};
+  const answer = await fetch(path, { method, body, headers, signal });
+  if (!answer.ok) throw Object.assign(new Error(await answer.text()), { status: answer.status });
+  return answer;
+}
 export const askJson = async (path, signal) => (await ask(path, signal)).json();
 
 // Do something now and again and again, until the page is left; not while nobody can see it.

@@ -6,9 +6,10 @@ import { overview } from "./overview.js";
 import { parcel, parcels } from "./parcels.js";
 import { plc } from "./plc.js";
 import { setup } from "./setup.js";
+import { site } from "./site.js";
 import { trend } from "./trend.js";
 
-const PAGES = { overview, parcels, trend, plc, events, setup };
+const PAGES = { overview, parcels, trend, plc, events, setup, site };
 // One of a list is part of it.
 const OTHERS = { parcel };
 const LIST_OF = { parcel: "parcels" };

@@ -2,11 +2,9 @@
 
 import { ask, h, number, remember, remembered, svg, t } from "./common.js";
 import { pull } from "./live.js";
-import { forget, keep, kept, tar } from "./stills.js";
+import { BOARD, boardValue, forCalibration, forget, keep, kept, saveForStick } from "./stills.js";
 
 const CORNERS = "#50ff78";
-// Inner corners of a board, and what is sane of it: as `calibration.toml` on a stick.
-const BOARD = { columns: [9, 3, 60], rows: [6, 3, 60], square_mm: [25, 1, 1000], thickness_mm: [3, 0, 200] };
 // A still of a lens: the board stood, within so many pixels from one picture to the next; and is
 // elsewhere than in every other still, by this share of the picture's width.
 const STANDS_PX = 2;
@@ -136,7 +134,6 @@ function boardAid(signal) {
   let before = null;
   let asked = false;
 
-  const value = (name) => Math.min(Math.max(Number(inputs[name].value) || BOARD[name][0], BOARD[name][1]), BOARD[name][2]);
   const chosen = () => stills.filter((still) => still.folder === folder.value);
   async function renew() {
     try {
@@ -169,7 +166,7 @@ function boardAid(signal) {
     for (const still of stills) await forget(still.key);
     await renew();
   });
-  save.addEventListener("click", () => download(stills, value));
+  save.addEventListener("click", () => saveForStick(forCalibration(stills), "beltgauge-stills.tar"));
   renew();
 
   async function show({ frame, board, size_px: size }) {
@@ -193,7 +190,7 @@ function boardAid(signal) {
     }
     await renew();
   }
-  const query = () => (folder.value === "none" ? null : `columns=${Math.round(value("columns"))}&rows=${Math.round(value("rows"))}`);
+  const query = () => (folder.value === "none" ? null : `columns=${Math.round(boardValue("columns"))}&rows=${Math.round(boardValue("rows"))}`);
   return { card, show, query };
 }
 
@@ -233,18 +230,4 @@ function missing(stills, folder) {
     : views < VIEWS.lens ? t("setup.board.more", { views, most: VIEWS.lens })
     : t("setup.board.enough", { views });
   return { words, cells };
-}
-
-// What a stick takes: unpacked there, the folder is complete but for the configuration.
-function download(stills, value) {
-  const settings = [`board = [${Math.round(value("columns"))}, ${Math.round(value("rows"))}]`, `square_mm = ${value("square_mm")}`, `board_thickness_mm = ${value("thickness_mm")}`, ""].join("\n");
-  const files = [{ name: "beltgauge/calibration.toml", bytes: new TextEncoder().encode(settings) }];
-  for (const folder of ["lens", "belt"]) {
-    stills.filter((still) => still.folder === folder).forEach(({ bytes }, k) => {
-      files.push({ name: `beltgauge/${folder}/${String(k + 1).padStart(3, "0")}.pgm`, bytes });
-    });
-  }
-  const address = URL.createObjectURL(tar(files));
-  h("a", { href: address, download: "beltgauge-stills.tar" }).click();
-  setTimeout(() => URL.revokeObjectURL(address), 60000);
 }

@@ -1,5 +1,7 @@
 // Stills of the board that were kept in this browser, which survive that the page is loaded again, and
-// the archive that takes them to a USB stick.
+// the archives that take them, and a site, to a USB stick and back.
+
+import { h, remembered } from "./common.js";
 
 const DATABASE = "beltgauge";
 const STORE = "stills";
@@ -32,8 +34,50 @@ export const keep = (still) => within("readwrite", (store) => store.add(still));
 export const kept = () => within("readonly", (store) => store.getAll());
 export const forget = (key) => within("readwrite", (store) => store.delete(key));
 
+// Inner corners of a board, its squares and its thickness: usual, least, most; as `calibration.toml` has them.
+export const BOARD = { columns: [9, 3, 60], rows: [6, 3, 60], square_mm: [25, 1, 1000], thickness_mm: [3, 0, 200] };
+export function boardValue(name) {
+  const [usual, least, most] = BOARD[name];
+  return Math.min(Math.max(Number(remembered(`board.${name}`) ?? usual) || usual, least), most);
+}
+
+// What calibrates the camera: files as in the folder of a stick.
+export function forCalibration(stills) {
+  const settings = [`board = [${Math.round(boardValue("columns"))}, ${Math.round(boardValue("rows"))}]`, `square_mm = ${boardValue("square_mm")}`,
+    `board_thickness_mm = ${boardValue("thickness_mm")}`, ""].join("\n");
+  const files = [textFile("calibration.toml", settings)];
+  for (const folder of ["lens", "belt"]) {
+    stills.filter((still) => still.folder === folder).forEach(({ bytes }, k) => {
+      files.push({ name: `${folder}/${String(k + 1).padStart(3, "0")}.pgm`, bytes });
+    });
+  }
+  return files;
+}
+export const textFile = (name, text) => ({ name, bytes: new TextEncoder().encode(text) });
+
+// A file for the visitor: the folder of a stick, packed.
+export function saveForStick(files, name) {
+  const address = URL.createObjectURL(tar(files.map((file) => ({ ...file, name: `beltgauge/${file.name}` }))));
+  h("a", { href: address, download: name }).click();
+  setTimeout(() => URL.revokeObjectURL(address), 60000);
+}
+
+// The files of such an archive, without the folder; of what else is in it nothing.
+export function untar(buffer) {
+  const files = [];
+  for (let at = 0; at + 512 <= buffer.byteLength;) {
+    const field = (start, length) => new TextDecoder().decode(new Uint8Array(buffer, at + start, length)).split("\0")[0];
+    const [name, size, kind] = [field(0, 100), parseInt(field(124, 12), 8), field(156, 1)];
+    if (!name || !(size >= 0) || at + 512 + size > buffer.byteLength) break;
+    const plain = name.replace(/^\.?\/?beltgauge\//, "");
+    if ((kind === "0" || kind === "") && plain !== name) files.push({ name: plain, bytes: new Uint8Array(buffer, at + 512, size) });
+    at += 512 + Math.ceil(size / 512) * 512;
+  }
+  return files;
+}
+
 // A tar archive (POSIX ustar) of files: name, bytes.
-export function tar(files) {
+function tar(files) {
   const blocks = files.flatMap(({ name, bytes }) => [header(name, bytes.byteLength), bytes, new Uint8Array((512 - (bytes.byteLength % 512)) % 512)]);
   return new Blob([...blocks, new Uint8Array(1024)], { type: "application/x-tar" });
 }
