@@ -10,10 +10,14 @@ use beltgauge::web;
 use common::page::{PATIENCE, Server, Still, body, status};
 use common::{scratch, write_site};
 use minisign::KeyPair;
+use std::io::Write;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::{Duration, Instant};
+
+/// After a wrong code.
+const PAUSE: Duration = Duration::from_millis(500);
 
 /// A machine with a site in force, and its page.
 struct Machine {
@@ -234,7 +238,7 @@ fn a_code_is_used_up_and_guessing_is_slow_however_many_guess() {
             scope.spawn(|| assert_eq!(status(&machine.sign_in("00000-00000")), 403));
         }
     });
-    assert!(start.elapsed() >= GUESSES * Duration::from_millis(500), "one after the other");
+    assert!(start.elapsed() >= (GUESSES - 1) * PAUSE, "one after the other");
     let long = "0".repeat(100_000);
     assert_eq!(status(&machine.sign_in(&long)), 403);
     // A cookie that somebody else has put there beforehand becomes nobody's.
@@ -245,6 +249,22 @@ fn a_code_is_used_up_and_guessing_is_slow_however_many_guess() {
     let planted = machine.ask("GET", "/api/session", "Cookie: beltgauge=planted\r\n", b"");
     assert!(body(&planted)["token"].is_null());
     assert_eq!(status(&machine.sign_in(&code)), 403, "it is used up");
+}
+
+#[test]
+fn who_guesses_and_hangs_up_makes_the_next_wait_all_the_same() {
+    let machine = Machine::new("change-hang-up");
+    let code = machine.store.code().expect("kept");
+    let mut guess = machine.server.connect();
+    let request = "POST /api/session HTTP/1.1\r\nHost: localhost\r\nOrigin: http://localhost\r\n\
+                   Content-Length: 1\r\n\r\n0";
+    guess.write_all(request.as_bytes()).expect("open");
+    // It was tried by then; a right one is answered at once.
+    std::thread::sleep(PAUSE / 5);
+    drop(guess);
+    let start = Instant::now();
+    assert_eq!(status(&machine.sign_in(&code)), 200);
+    assert!(start.elapsed() >= PAUSE / 2, "{:?}", start.elapsed());
 }
 
 #[test]

@@ -5,6 +5,7 @@
 //! (`Origin`). The code for signing in is tried by one visitor at a time, and a wrong one costs a pause.
 
 use super::api::Sources;
+use super::board::Board;
 use super::model::{Change, Event, Keeper, WorkState};
 use axum::body::{Body, to_bytes};
 use axum::extract::{Extension, Path, State};
@@ -28,10 +29,8 @@ const TOKEN: &str = "x-beltgauge-token";
 const CODE_BYTES_MAX: usize = 64;
 /// A file that a visitor brings.
 const FILE_BYTES_MAX: usize = 32 << 20;
-/// A wrong code costs this, and so does every one that waits behind it.
+/// After a wrong code the next one waits for this, whoever brings it.
 const WRONG_CODE: Duration = Duration::from_millis(500);
-/// Events of one kind that are the visitor's own doing.
-const SIGNED_IN: &str = "signed_in";
 
 /// Why something is not done.
 struct Refusal {
@@ -124,10 +123,10 @@ async fn ask<T: Send + 'static>(
     answer.map_err(|_| refused(StatusCode::INTERNAL_SERVER_ERROR, text))
 }
 
-fn note(from: &Sources, kind: &'static str, visitor: IpAddr) {
+fn note(board: &Board, kind: &'static str, visitor: IpAddr) {
     tracing::info!(%visitor, "page: {kind}");
     let utc_ms = crate::event::clock::utc_ms();
-    from.board.note(Event { n: 0, utc_ms, kind, code: 0, detail: visitor.to_string() });
+    board.note(Event { n: 0, utc_ms, kind, code: 0, detail: visitor.to_string() });
 }
 
 /// Whether anything can be changed, and by whoever asks.
@@ -153,14 +152,17 @@ async fn sign_in(
     let wrong = || refused(StatusCode::FORBIDDEN, "this is not the code, or it was used before");
     let code = to_bytes(body, CODE_BYTES_MAX).await.map_err(|_| wrong())?;
     let code = String::from_utf8_lossy(&code).into_owned();
-    // One at a time, with the pause: however many connections guess.
-    let _turn = from.sign_ins.lock().await;
+    let turn = from.sign_ins.lock_owned().await;
     let secret = ask(keeper, move |keeper| keeper.sign_in(&code)).await?.map_err(failed)?;
     let Some(secret) = secret else {
-        tokio::time::sleep(WRONG_CODE).await;
+        // Also when whoever guessed does not wait for the answer.
+        tokio::spawn(async move {
+            tokio::time::sleep(WRONG_CODE).await;
+            drop(turn);
+        });
         return Err(wrong());
     };
-    note(&from, SIGNED_IN, visitor);
+    note(&from.board, "signed_in", visitor);
     // The keeper knows how long it is good; the browser forgets it when it is closed.
     let cookie = format!("{COOKIE}={secret}; Path=/; HttpOnly; SameSite=Strict");
     let standing = Json(Standing { can_be_changed: true, token: Some(token(&secret)) });
@@ -227,7 +229,7 @@ async fn change(
         _ => return Err(refused(StatusCode::NOT_FOUND, "the changes are check, apply and back")),
     };
     ask(keeper, move |keeper| keeper.change(change)).await?.map_err(failed)?;
-    note(&from, kind, visitor);
+    note(&from.board, kind, visitor);
     Ok((StatusCode::ACCEPTED, Json(WorkState::Busy)).into_response())
 }
 
