@@ -8,9 +8,7 @@
 
 use crate::error::{Error, Result};
 use crate::sandbox;
-use crate::store::stick::{
-    BELT_FOLDER, FILE_BYTES_MAX, FOLDER, LENS_FOLDER, STILLS_MAX, is_plain_name,
-};
+use crate::store::stick::{BELT_FOLDER, FOLDER, LENS_FOLDER, STILLS_MAX, is_plain_name};
 use crate::store::{Session, Store, files};
 use crate::web::{Change, Work, WorkState};
 use crate::{config, web};
@@ -197,8 +195,7 @@ impl Tray {
                 .allowed("a plain name, alone or behind lens/ or belt/"));
         }
         let len = bytes.len() as u64;
-        if len > FILE_BYTES_MAX || self.bytes + len > TRAY_BYTES_MAX || self.files == TRAY_FILES_MAX
-        {
+        if self.bytes + len > TRAY_BYTES_MAX || self.files == TRAY_FILES_MAX {
             return Err(Error::configuration("this is too much")
                 .allowed(format!("{TRAY_FILES_MAX} files, {} MiB together", TRAY_BYTES_MAX >> 20))
                 .remedy("keep fewer stills, or bring them on a stick"));

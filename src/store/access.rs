@@ -5,13 +5,12 @@
 //! signed in is known by a random secret, of which the store has the digest alone; it is good until the
 //! machine starts anew, and survives that the program does.
 
+use super::manifest::sha256;
 use super::{Store, files};
 use crate::error::{Error, Result};
 use rustix::rand::{GetRandomFlags, getrandom};
 use rustix::time::{ClockId, clock_gettime};
 use serde::{Deserialize, Serialize};
-use sha2::{Digest, Sha256};
-use std::fmt::Write as _;
 
 pub(super) const ACCESS: &str = "access.toml";
 /// Letters and digits that nobody takes for another (Crockford's base 32).
@@ -47,7 +46,9 @@ impl Session {
     /// Whether it is of whoever has this secret, and not over.
     pub fn is_of(&self, secret: &str) -> bool {
         // Compared are digests: how long that takes tells nothing of the secret.
-        self.secret_sha256 == digest(secret) && self.boot == boot() && now_s() < self.until_s
+        self.secret_sha256 == sha256(secret.as_bytes())
+            && self.boot == boot()
+            && now_s() < self.until_s
     }
 }
 
@@ -65,12 +66,12 @@ impl Store {
     /// Sign in with the code, which is used up: the secret that whoever brought it is known by. Whoever had
     /// signed in before is signed out. `None`: it is another code.
     pub fn sign_in(&self, code: &str) -> Result<Option<(String, Session)>> {
-        if digest(&normal(code)) != digest(&normal(&self.code()?)) {
+        if sha256(normal(code).as_bytes()) != sha256(normal(&self.code()?).as_bytes()) {
             return Ok(None);
         }
-        let secret = hex(&random::<SECRET_BYTES>()?);
+        let secret = sha256(&random::<SECRET_BYTES>()?);
         let until_s = now_s() + SHIFT_S;
-        let session = Session { secret_sha256: digest(&secret), boot: boot(), until_s };
+        let session = Session { secret_sha256: sha256(secret.as_bytes()), boot: boot(), until_s };
         self.keep_access(&Access { code: new_code()?, session: Some(session.clone()) })?;
         Ok(Some((secret, session)))
     }
@@ -124,17 +125,6 @@ fn random<const N: usize>() -> Result<[u8; N]> {
         Ok(n) if n == N => Ok(bytes),
         _ => Err(Error::failure("the kernel gives no random numbers")),
     }
-}
-
-fn digest(text: &str) -> String {
-    hex(&Sha256::digest(text.as_bytes()))
-}
-
-fn hex(bytes: &[u8]) -> String {
-    bytes.iter().fold(String::new(), |mut text, byte| {
-        let _ = write!(text, "{byte:02x}"); // writing to a String cannot fail
-        text
-    })
 }
 
 fn boot() -> String {

@@ -16,7 +16,6 @@ use axum::{Json, Router};
 use serde::Serialize;
 use sha2::{Digest, Sha256};
 use std::borrow::Cow;
-use std::fmt::Write as _;
 use std::net::IpAddr;
 use std::sync::Arc;
 use std::time::Duration;
@@ -93,11 +92,7 @@ fn secret(keeper: &dyn Keeper, headers: &HeaderMap) -> Option<String> {
 
 /// Only a page of this machine can know it: it is in an answer that no other can read.
 fn token(secret: &str) -> String {
-    let digest = Sha256::digest(format!("token {secret}").as_bytes());
-    digest.iter().fold(String::new(), |mut text, byte| {
-        let _ = write!(text, "{byte:02x}"); // writing to a String cannot fail
-        text
-    })
+    format!("{:x}", Sha256::digest(format!("token {secret}")))
 }
 
 /// The keeper, for whoever has signed in and asks from the machine's own page.

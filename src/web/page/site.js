@@ -120,7 +120,7 @@ async function whoHasSignedIn(room, token, enter, signal) {
     const files = withConfiguration(forCalibration(stills), current.configuration ?? "");
     // Without stills for it the lens stays.
     if (count("lens") === 0 && current.camera) files.push(textFile("lens.toml", current.camera.text));
-    change("apply", files);
+    asked(files);
   };
   const backup = () => {
     const files = withConfiguration([], current.configuration ?? "");
