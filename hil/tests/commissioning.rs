@@ -38,7 +38,9 @@ async fn a_camera_is_set_up_by_the_page_and_its_stills_calibrate_it() {
     browser.wait("a sharp place", best).await;
 
     // With nothing asked for nothing is kept.
-    let kept = "Number(document.querySelector('[data-stills]').dataset.stills)";
+    // It is known once the browser has opened its store, which a picture may forestall: no number until then.
+    let kept = "Number(document.querySelector('[data-stills]')?.dataset.stills ?? NaN)";
+    browser.wait("the count of stills", &format!("return !isNaN({kept})")).await;
     assert_eq!(browser.run(&format!("return {kept}")).await, json!(0));
     keep_stills(&browser, "lens").await;
     // Each is shown for a second; those of the board on the belt serve as well.
