@@ -2,8 +2,8 @@
 //!
 //! `WORLDS=30 cargo test --release --test worlds -- --nocapture` judges so many of each class (`CLASS=dense`:
 //! of one); the table goes to `target/tmp/worlds.txt`, `PLOT=tests/worlds/worlds.svg` draws it. `REPLAY=hard_light:3` writes
-//! the scenario, some frames and every record of one world to `target/tmp/world`, and says which of its
-//! properties matters: each in turn is drawn as in an easy world (`BISECT=0`: pictures alone).
+//! the scenario, a recording with its site and some frames of one world to `target/tmp/world`, and says which of
+//! its properties matters: each in turn is drawn as in an easy world (`BISECT=0`: files alone).
 
 #[path = "worlds/class.rs"]
 mod class;
@@ -24,6 +24,8 @@ use class::{Class, Property};
 use generator::{World, draw};
 use judge::{Verdict, judge};
 use std::fmt::Write as _;
+use std::fs::File;
+use std::io::Write as _;
 use std::path::Path;
 use std::sync::Mutex;
 use std::sync::atomic::{AtomicUsize, Ordering};
@@ -211,13 +213,30 @@ fn every_property_is_drawn_over_its_range() {
     assert!(parcels().any(|p| p.height_mm > 350.0) && parcels().any(|p| p.height_mm < 4.0));
 }
 
-/// Every twentieth frame of a world, and its last one, as pictures.
-fn write_pictures(world: &World, folder: &Path) {
+/// A world as files that `beltgauge measure recording.y4m --config beltgauge.toml` takes, and every
+/// twentieth frame as a picture.
+fn write_world(world: &World, folder: &Path) {
+    let scenario: toml::Table = toml::from_str(&world.text).expect("valid");
+    let camera = toml::to_string(&scenario["camera"]).expect("a table");
+    let write = |name: &str, text: &str| std::fs::write(folder.join(name), text).expect("writable");
+    write("scenario.toml", &world.text);
+    write("camera.toml", &camera);
+    write("beltgauge.toml", &world.config);
     let mut source = frames(world);
     let [width, height] = source.size_px();
+    let mut recording = File::create(folder.join("recording.y4m")).expect("writable");
+    let mut times =
+        "# frame number and seconds since the first frame, a line for every picture\n".to_owned();
+    writeln!(recording, "YUV4MPEG2 W{width} H{height} F{}:1 Ip Cmono", source.fps())
+        .expect("writable");
     let mut frame = vec![0; width * height];
     let mut number = 0u64;
     while let Some(time) = source.next_into(&mut frame).expect("renders") {
+        recording
+            .write_all(b"FRAME\n")
+            .and_then(|()| recording.write_all(&frame))
+            .expect("writable");
+        let _ = writeln!(times, "{} {}", time.index, time.t_s);
         if number.is_multiple_of(20) {
             let picture = folder.join(format!("{:04}.png", time.index));
             let grey = image::ExtendedColorType::L8;
@@ -226,6 +245,7 @@ fn write_pictures(world: &World, folder: &Path) {
         }
         number += 1;
     }
+    write("recording.y4m.times", &times);
 }
 
 /// One world, `class:seed`, with its pictures, and which of its properties matters.
@@ -236,9 +256,8 @@ fn replay(name: &str) {
     let seed = seed.parse().expect("a seed");
     let folder = common::scratch("world");
     let world = draw(seed, |_| class);
-    std::fs::write(folder.join("scenario.toml"), &world.text).expect("writable");
-    write_pictures(&world, &folder);
-    eprintln!("scenario and frames are in {}; {:?}", folder.display(), world.faults);
+    write_world(&world, &folder);
+    eprintln!("scenario, recording and site are in {}; {:?}", folder.display(), world.faults);
     if std::env::var("BISECT").as_deref() == Ok("0") {
         return;
     }

@@ -32,6 +32,8 @@ pub struct Room {
 pub struct World {
     pub text: String,
     pub scenario: Scenario,
+    /// The site's configuration; its camera is the scenario's.
+    pub config: String,
     pub site: Site,
     pub faults: Faults,
 }
@@ -68,14 +70,14 @@ pub fn draw(seed: u64, class_of: impl Fn(Property) -> Class) -> World {
     let scenario = parse(&text);
     let [x, y] = room.half_mm;
     let config = format!(
-        "[camera]\ncalibration = \"the scenario's\"\n[belt]\nspeed_mm_per_s = {nominal}\n\
+        "[camera]\ncalibration = \"camera.toml\"\n[belt]\nspeed_mm_per_s = {nominal}\n\
          [zone]\nx_min_mm = -{x}\nx_max_mm = {x}\ny_min_mm = -{y}\ny_max_mm = {y}\n\
          [view]\nheight_max_mm = {}\n",
         room.height_max_mm
     );
     let camera = scenario.camera().expect("a valid camera");
     let site = Site::new(Config::parse(&config).expect("valid"), camera).expect("a zone in view");
-    World { text, scenario, site, faults }
+    World { text, scenario, config, site, faults }
 }
 
 /// Looks at the middle of the zone, and sees all of it.
