@@ -224,6 +224,7 @@ fn write_world(world: &World, folder: &Path) {
     write("beltgauge.toml", &world.config);
     let mut source = frames(world);
     let [width, height] = source.size_px();
+    // By hand: the product's recorder leaves frames out when the disk is slow, and a replay needs them all.
     let mut recording = File::create(folder.join("recording.y4m")).expect("writable");
     let mut times =
         "# frame number and seconds since the first frame, a line for every picture\n".to_owned();
