@@ -3,7 +3,15 @@
 use crate::event::{Flags, ParcelRecord, Shape};
 
 /// Dimensions that differ by more than this many sigmas disagree.
-const DISAGREE_SIGMA: f64 = 3.0;
+pub(super) const DISAGREE_SIGMA: f64 = 3.0;
+
+/// What is not so many sigmas over the belt may be the belt.
+const RISES_SIGMA: f64 = 2.0;
+
+/// Whether a record's height is more than none.
+pub(super) fn rises(record: &ParcelRecord) -> bool {
+    record.height_mm > RISES_SIGMA * record.sigma_height_mm
+}
 
 /// Whether a record is without a doubt.
 pub(super) fn is_sure(record: &ParcelRecord) -> bool {
@@ -11,7 +19,7 @@ pub(super) fn is_sure(record: &ParcelRecord) -> bool {
 }
 
 /// The record of a parcel that both saw: of what is not in doubt, else of the one that more edges confirm; of two
-/// that are no cuboids the smaller one. `edge_shares`: of the edges that silhouettes and heights led to.
+/// that are no cuboids the smaller one. A silhouette that may be one of the belt is no witness of a parcel. `edge_shares`: of the edges that silhouettes and heights led to.
 pub(super) fn agreed(
     silhouettes: &ParcelRecord,
     heights: &ParcelRecord,
@@ -21,7 +29,7 @@ pub(super) fn agreed(
     let volume = |r: &ParcelRecord| r.length_mm * r.width_mm * r.height_mm;
     let neither_is_box = [silhouettes, heights].iter().all(|r| r.shape != Shape::Box);
     let by_silhouettes = silhouettes.not_measured.is_none()
-        && match (is_sure(silhouettes), is_sure(heights)) {
+        && match (is_sure(silhouettes) && rises(silhouettes), is_sure(heights)) {
             (false, false) if neither_is_box => volume(silhouettes) < volume(heights),
             (true, true) => edge_shares[0] > edge_shares[1],
             (sure, other) => sure && !other,
@@ -143,6 +151,16 @@ pub(super) mod tests {
         let doubt = flagged(record([205.0, 155.0, 66.0], 6.0), Flags::HEIGHT_UNCERTAIN);
         assert_eq!(told(&sure, &doubt), sure);
         assert_eq!(told(&doubt, &sure), sure);
+    }
+
+    #[test]
+    fn a_silhouette_that_may_be_one_of_the_belt_makes_no_doubtful_height_sure() {
+        let flat = record([126.0, 51.0, 0.5], 1.2);
+        let doubt = flagged(record([126.0, 52.0, 0.1], 1.5), Flags::HEIGHT_DISPUTED);
+        assert!(!is_sure(&told(&flat, &doubt)));
+        // Heights that are sure need no witness.
+        let sure = record([126.0, 52.0, 4.0], 0.7);
+        assert_eq!(told(&flat, &sure), sure);
     }
 
     #[test]

@@ -7,7 +7,7 @@
 //! A silhouette that is in doubt waits until all heights at its place are known: where these show the belt it was a
 //! shadow, and where they show parcels it was theirs, run together, or a piece of them.
 
-use super::agreement::{agreed, is_sure, spread};
+use super::agreement::{DISAGREE_SIGMA, agreed, is_sure, rises, spread};
 use super::{PIECE_MARGIN_PX, Pipeline};
 use crate::event::{Flags, ParcelRecord, Shape};
 use crate::stage::measure::{self, Outline, Params};
@@ -22,8 +22,6 @@ const LEAVING_MAX: usize = 64;
 const DECISIONS_MAX: usize = 16;
 /// Cuboids that together fill this share of one are what it was taken for: a gap is narrower than a label's rest.
 const PARTS_SHARE_MIN: f64 = 0.8;
-/// What is not so many sigmas over the belt may be the belt.
-const RISES_SIGMA: f64 = 2.0;
 
 /// What the silhouettes showed of a parcel that has left.
 #[derive(Clone, Copy)]
@@ -122,6 +120,19 @@ impl Leaving {
         around.next().copied()
     }
 
+    /// The silhouette that something is a label on: it holds the place, and is as high.
+    fn labelled(&mut self, place: &Rectangle, record: &ParcelRecord) -> Option<&mut Silhouette> {
+        self.silhouettes.iter_mut().find(|s| {
+            place.is_detail_of(&s.place) && !s.is_run_together() && is_as_high(&s.record, record)
+        })
+    }
+
+    /// Whether silhouettes saw a part of a place as something as high as what was seen there.
+    fn has_part(&self, place: &Rectangle, record: &ParcelRecord) -> bool {
+        let mut parts = self.silhouettes.iter().filter(|s| s.place.is_detail_of(place));
+        parts.any(|s| is_sure(&s.record) && is_as_high(&s.record, record))
+    }
+
     /// Remove the silhouette at the place of a pass.
     fn take_silhouette(&mut self, place: &Rectangle) -> Option<Silhouette> {
         let found = self.silhouettes.iter().position(|s| s.place.is_same_place(place))?;
@@ -165,14 +176,17 @@ impl Pipeline {
         while let Some(passed) = self.leaving.passes.get(i).copied() {
             let place = passed.face.rectangle;
             if !all {
-                if let Some(slot) = self.riding_at(|track| track.is_same_place(&place)) {
-                    self.leave(slot, Flags::default());
-                } else if self
-                    .riding_at(|track| place.is_detail_of(track) || track.is_detail_of(&place))
-                    .is_some()
+                let rides_on = |track: &Rectangle| place.is_detail_of(track);
+                let is_same = self.riding_at(|track| track.is_same_place(&place));
+                let is_part = |track: &Rectangle| track.is_detail_of(&place);
+                if self.riding_at(rides_on).is_some()
+                    || is_same.is_none() && self.riding_at(is_part).is_some()
                 {
                     i += 1;
                     continue;
+                }
+                if let Some(slot) = is_same {
+                    self.leave(slot, Flags::default());
                 }
             }
             self.leaving.passes.remove(i);
@@ -207,13 +221,20 @@ impl Pipeline {
             self.counters.slivers += 1;
             return;
         }
+        if let Some(outer) = self.leaving.labelled(place, &heights)
+            && outer.record.shape == Shape::Box
+        {
+            return;
+        }
         let silhouettes = self.leaving.take_silhouette(place);
         let around = self.leaving.silhouette_around(place);
-        let rises = heights.height_mm > RISES_SIGMA * heights.sigma_height_mm;
         let record = match (&silhouettes, around) {
             (Some(silhouettes), _) => {
+                let mut seen = silhouettes.record;
+                // What does not rise over the belt is no witness of a parcel.
+                seen.flags.set(Flags::HEIGHT_DISPUTED, is_sure(&seen) && !rises(&seen));
                 let edge_shares = [silhouettes.edge_share, passed.measured.estimate.edge_share];
-                agreed(&silhouettes.record, &heights, edge_shares, self.sigma_max_mm())
+                agreed(&seen, &heights, edge_shares, self.sigma_max_mm())
             }
             // A label, or glare, on what the silhouettes show.
             (None, Some(around)) if around.is_certain || !is_sure(&heights) => return,
@@ -221,7 +242,7 @@ impl Pipeline {
                 self.leaving.silhouettes.retain(|s| !place.is_detail_of(&s.place));
                 spread(heights, &around.record, self.sigma_max_mm())
             }
-            (None, None) if !rises => return,
+            (None, None) if !rises(&heights) && !self.leaving.has_part(place, &heights) => return,
             // What has neither a face nor a silhouette is noise.
             (None, None)
                 if heights.shape != Shape::Box && !self.differs_from_belt(&heights, place) =>
@@ -230,6 +251,8 @@ impl Pipeline {
             }
             (None, _) => heights,
         };
+        let rival = passed.rival().map(|rival| self.record_of_pass(&rival));
+        let record = rival.map_or(record, |rival| spread(record, &rival, self.sigma_max_mm()));
         self.leaving.tell(*place, &record);
         let silhouettes = silhouettes.map(|silhouettes| silhouettes.record);
         let heights = Some((heights, *passed));
@@ -273,6 +296,7 @@ impl Pipeline {
         let place = &silhouette.place;
         self.leaving.passes.iter().any(|passed| passed.face.rectangle.overlaps(place))
             || self.passes.expects(place)
+            || self.riding_at(|track| place.is_detail_of(track)).is_some()
             || !silhouette.is_certain && !self.passes.has_settled(place)
     }
 
@@ -281,13 +305,21 @@ impl Pipeline {
         if self.is_explained(silhouette) {
             return;
         }
+        // Of two borders at one height the outermost is the parcel's; if that is no cuboid's, either may be.
+        let sigma_max_mm = self.sigma_max_mm();
+        if let Some(outer) = self.leaving.labelled(&place, &record) {
+            if outer.record.shape != Shape::Box {
+                outer.record = spread(outer.record, &record, sigma_max_mm);
+                outer.is_certain = false;
+            }
+            return;
+        }
         let is_measured = record.not_measured.is_none();
         if is_measured && !is_sure(&record) && self.passes.shows_belt(&place, record.height_mm) {
             self.counters.slivers += 1;
             return;
         }
-        let rises = record.height_mm > RISES_SIGMA * record.sigma_height_mm;
-        let is_doubted = is_sure(&record) && !(is_certain && rises);
+        let is_doubted = is_sure(&record) && !(is_certain && rises(&record));
         record.flags.set(Flags::HEIGHT_DISPUTED, is_doubted);
         self.leaving.tell(place, &record);
         let silhouettes = Some(silhouette.record);
@@ -329,6 +361,12 @@ impl Pipeline {
         // Only who asks for reasons misses one.
         let _ = self.leaving.decisions.push(decision);
     }
+}
+
+/// Whether two heights differ by no more than their sigmas.
+fn is_as_high(one: &ParcelRecord, other: &ParcelRecord) -> bool {
+    let sigma_mm = one.sigma_height_mm.hypot(other.sigma_height_mm);
+    (one.height_mm - other.height_mm).abs() <= DISAGREE_SIGMA * sigma_mm
 }
 
 /// The footprint of a cuboid that is there when the belt has travelled so far.
@@ -411,6 +449,23 @@ mod tests {
         let label = Rectangle { x_mm: 900.0, length_mm: 80.0, ..BOTH };
         assert!(leaving.take_silhouette(&label).is_none());
         assert_eq!(leaving.silhouette_around(&label).expect("there").place, ahead.place);
+    }
+
+    #[test]
+    fn a_label_is_on_what_holds_it_and_is_as_high() {
+        let carton = silhouette(0.0, 400.0, true);
+        let label = Rectangle { length_mm: 80.0, width_mm: 50.0, ..BOTH };
+        let as_high = record([80.0, 50.0, 61.0], 0.5);
+        let found = leaving(&[carton]).labelled(&label, &as_high).map(|s| s.place);
+        assert_eq!(found, Some(carton.place));
+        // A smaller parcel on a larger one is no label, nor is what lies on several run together.
+        let on_top = record([80.0, 50.0, 110.0], 0.5);
+        assert!(leaving(&[carton]).labelled(&label, &on_top).is_none());
+        let mut together = carton;
+        together.record.flags.set(Flags::MERGED, true);
+        assert!(leaving(&[together]).labelled(&label, &as_high).is_none());
+        // Nor is a parcel a label on itself.
+        assert!(leaving(&[carton]).labelled(&carton.place, &carton.record).is_none());
     }
 
     #[test]

@@ -46,6 +46,12 @@ impl Passed {
         self.newest.at.sigma_since(&self.first.at)
     }
 
+    /// The same pass with the other cuboid that it may be; X is not moved to the reference view.
+    pub fn rival(&self) -> Option<Self> {
+        let estimate = self.measured.rival?;
+        Some(Self { measured: Measured { estimate, rival: None, ..self.measured }, ..*self })
+    }
+
     /// Mean speed of the belt over the pass, mm/s.
     pub fn speed_mm_per_s(&self) -> f64 {
         let elapsed_s = self.newest.time.t_s - self.first.time.t_s;

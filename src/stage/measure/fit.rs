@@ -6,6 +6,7 @@
 //! Source: Nocedal and Wright, chapter 10; Huber 1964 and Tukey's biweight for outliers.
 
 use super::corners::TopMotion;
+use super::dissent::Dissent;
 use super::model::{
     DIRECTIONS, EDGES, EdgeId, HEIGHT, LENGTH, N, Outline, Params, Rounding, SCALE, WIDTH, X, Y,
     YAW, canonical, direction,
@@ -156,8 +157,9 @@ struct EdgeUse {
     contrast: f64,
     /// For each edge.
     polarity: Polarity,
-    /// For each edge of the top face.
+    /// For each edge of the top face, these two.
     dark: [DarkEdge; EDGES / 2],
+    dissent: [Dissent; EDGES / 2],
 }
 
 impl Estimate {
@@ -165,6 +167,11 @@ impl Estimate {
     pub fn disputes_height(&self, other: &Self) -> bool {
         let sigma_mm = self.sigma[HEIGHT].hypot(other.sigma[HEIGHT]);
         (self.params[HEIGHT] - other.params[HEIGHT]).abs() > DISPUTED_SIGMA * sigma_mm
+    }
+
+    /// How much another estimate of the same parcel is off in length, width and height together, mm.
+    pub fn off_mm(&self, other: &Self) -> f64 {
+        [LENGTH, WIDTH, HEIGHT].map(|k| (self.params[k] - other.params[k]).abs()).iter().sum()
     }
 
     /// What tells a right fit from a wrong one: contrast, less what the silhouettes disagree; of
@@ -286,10 +293,13 @@ impl Problem<'_> {
         };
         let mut variance = covariance.diagonal().map(|v| excess * v.max(0.0));
         let step_sigma = excess.sqrt() * edge_sigma;
-        for dark in &used.dark {
-            let shadow_mm = dark.sigma_mm(params[HEIGHT], step_sigma, self.geometry.mm_per_px);
-            let off = covariance * dark.rows() * shadow_mm
-                / (CORRELATED_SAMPLES * edge_sigma * edge_sigma);
+        let by_shadow = |dark: &DarkEdge| {
+            (*dark.rows(), dark.sigma_mm(params[HEIGHT], step_sigma, self.geometry.mm_per_px))
+        };
+        let by_others = |dissent: &Dissent| (*dissent.rows(), dissent.sigma_mm());
+        let open = used.dark.iter().map(by_shadow).chain(used.dissent.iter().map(by_others));
+        for (rows, open_mm) in open {
+            let off = covariance * rows * open_mm / (CORRELATED_SAMPLES * edge_sigma * edge_sigma);
             variance += off.component_mul(&off);
         }
         let mut sigma = variance.map(f64::sqrt);
@@ -442,6 +452,7 @@ impl Problem<'_> {
     ) -> EdgeUse {
         let mut used = EdgeUse::default();
         let sigma_mm = EDGE_SIGMA_PX * self.geometry.mm_per_px;
+        let dissent_mm = POLARITY_GATE_PX * self.geometry.mm_per_px;
         for view in self.sampled(views) {
             let outline = self.outline(view, params);
             let trust: [[f64; 2]; EDGES] =
@@ -456,9 +467,15 @@ impl Problem<'_> {
                 let facing = outline.side_visible[sample.edge.face()];
                 let known = polarity[e][usize::from(facing)];
                 let rising = if facing && !sample.edge.is_base() { RISING_TRUST } else { 1.0 };
-                let steps = sample.steps(self.geometry.mm_per_px);
-                let chosen = choose(steps, at, gate_mm, known, rising);
-                let Some((residual, slope)) = chosen else { continue };
+                let steps = || sample.steps(self.geometry.mm_per_px);
+                let top = (!sample.edge.is_base()).then_some(sample.edge.face());
+                let Some((residual, slope)) = choose(steps(), at, gate_mm, known, rising) else {
+                    let other = choose(steps(), at, dissent_mm, -known, rising);
+                    if let (Some(face), Some((residual, _))) = (top, other) {
+                        used.dissent[face].add_other(residual);
+                    }
+                    continue;
+                };
                 used.used += 1;
                 used.squares += residual * residual;
                 used.polarity[e][usize::from(facing)] += f64::from(slope.signum());
@@ -467,8 +484,11 @@ impl Problem<'_> {
                 used.contrast += biweight * f64::from(slope.abs().min(SLOPE_ENOUGH)).ln_1p();
                 let weight = trust[e][usize::from(slope > 0.0)] * biweight;
                 normal.add(residual, &row, weight / (CORRELATED_SAMPLES * sigma_mm * sigma_mm));
-                if slope > 0.0 && !sample.edge.is_base() {
-                    used.dark[sample.edge.face()].add(residual, &row, weight);
+                if let Some(face) = top {
+                    used.dissent[face].add_used(residual, &row, weight);
+                    if slope > 0.0 {
+                        used.dark[face].add(residual, &row, weight);
+                    }
                 }
             }
         }

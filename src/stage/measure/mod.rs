@@ -9,6 +9,7 @@
 
 pub mod budget;
 mod corners;
+mod dissent;
 mod fit;
 mod model;
 mod observe;
@@ -73,6 +74,8 @@ pub struct Measured {
     pub has_edges: bool,
     /// Corners on the top face and its edges disagree about the height.
     pub disputed: bool,
+    /// Another cuboid that explains the edges nearly as well.
+    pub rival: Option<Estimate>,
 }
 
 /// State of one track's pass.
@@ -314,13 +317,13 @@ impl Measure {
         let (cuboid, disputed) = self.cuboid(slot);
         let mut result = match cuboid {
             Some(cuboid) if is_box(&cuboid) => {
-                Measured { estimate: cuboid, is_box: true, has_edges: true, disputed }
+                Measured { estimate: cuboid, is_box: true, has_edges: true, disputed, rival: None }
             }
             other => {
                 let enclosing = self.enclosing(slot);
                 let estimate = enclosing.or(other).or(self.passes[slot].estimate)?;
                 let has_edges = other.is_some_and(|e| e.edge_count > 0);
-                Measured { estimate, is_box: false, has_edges, disputed: false }
+                Measured { estimate, is_box: false, has_edges, disputed: false, rival: None }
             }
         };
         let travel = at.travel_mm - self.passes[slot].first.travel_mm;

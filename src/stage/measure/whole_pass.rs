@@ -9,7 +9,7 @@ use crate::camera::BeltView;
 use crate::error::Result;
 use crate::kernel::scalar::bits::words;
 use crate::plan::{Block, Memory, Plan};
-use crate::stage::parcels::{Cuboid, Face, Rectangle};
+use crate::stage::parcels::{Cuboid, Face, NARROWER, Rectangle};
 use crate::stage::views::{Kept, VIEWS_MAX, Views};
 use crate::units::BeltRect;
 
@@ -17,7 +17,7 @@ use crate::units::BeltRect;
 const FACE_HEIGHT_SIGMA_MM: f64 = 6.0;
 /// The sides of a face that is no cuboid's are good to this, mm.
 const FACE_SIDE_SIGMA_MM: f64 = 5.0;
-/// A border further inside must explain this share of the edges more.
+/// A border is the better one beyond doubt when it explains this share of the edges more.
 const CLEARLY_BETTER: f64 = 0.03;
 /// Lower than this is the belt, mm.
 const HEIGHT_MIN_MM: f64 = 2.4;
@@ -99,18 +99,31 @@ impl WholePass {
         Some(Cuboid { rectangle, height_mm: p[HEIGHT], is_box: measured.is_box })
     }
 
-    /// Fit a cuboid. Of the borders that may be the face's, that one which most edges confirm.
+    /// Fit a cuboid: of the borders that may be the face's the outermost, unless clearly more edges confirm another. Of
+    /// those that nearly as many confirm, the one that differs most is its rival.
     fn fit(&mut self, views: &Views, face: &Face) -> Option<(Measured, Kept)> {
         let share = |(measured, _): &(Measured, Kept)| measured.estimate.edge_share;
         let mut fit = |border, rounds| self.fit_border(views, border, face.height_mm, rounds);
-        let mut best = fit(&face.rectangle, ROUNDS_AGAIN);
+        let mut best = fit(&face.rectangle, ROUNDS_AGAIN)?;
+        let mut others = heapless::Vec::<Estimate, NARROWER>::new();
         for border in face.narrower.iter().flatten() {
-            let least = best.as_ref().map_or(0.0, |best| share(best) + CLEARLY_BETTER);
-            let is_rival = fit(border, ROUNDS_RIVAL).is_some_and(|fitted| share(&fitted) > least);
-            let rival = if is_rival { fit(border, ROUNDS) } else { None };
-            best = rival.filter(|rival| share(rival) > least).or(best);
+            let least = share(&best) - CLEARLY_BETTER;
+            if fit(border, ROUNDS_RIVAL).is_none_or(|fitted| share(&fitted) <= least) {
+                continue;
+            }
+            let Some(mut other) = fit(border, ROUNDS) else { continue };
+            if share(&other) > share(&best) + CLEARLY_BETTER {
+                std::mem::swap(&mut other, &mut best);
+            }
+            // There are as many at most as there are borders.
+            let _ = others.push(other.0.estimate);
         }
-        best
+        let least = (share(&best) - CLEARLY_BETTER).max(BOX_EDGE_SHARE_MIN);
+        let off_mm = |other: &Estimate| best.0.estimate.off_mm(other);
+        let rivals = others.into_iter().filter(|other| other.edge_share > least);
+        let rival = rivals.max_by(|a, b| off_mm(a).total_cmp(&off_mm(b)));
+        best.0.rival = rival;
+        Some(best)
     }
 
     fn enclose(&mut self, views: &Views, face: &Face) -> Option<(Measured, Kept)> {
@@ -130,7 +143,8 @@ impl WholePass {
             edge_contrast: 0.0,
             reach_error: 0.0,
         };
-        let measured = Measured { estimate, is_box: false, has_edges: true, disputed: false };
+        let measured =
+            Measured { estimate, is_box: false, has_edges: true, disputed: false, rival: None };
         Some((measured, first?))
     }
 
@@ -202,7 +216,7 @@ impl WholePass {
         let is_box = estimate.edge_share >= BOX_EDGE_SHARE_MIN;
         let off_mm = (estimate.params[HEIGHT] - height_mm).abs();
         let disputed = off_mm > DISPUTED_SIGMA * FACE_HEIGHT_SIGMA_MM.hypot(estimate.sigma[HEIGHT]);
-        Some((Measured { estimate, is_box, has_edges, disputed }, first))
+        Some((Measured { estimate, is_box, has_edges, disputed, rival: None }, first))
     }
 
     /// Take profiles across a cuboid's edges in every view that has any of it in the zone. Returns how many these are,

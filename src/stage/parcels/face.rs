@@ -23,6 +23,8 @@ const FLAT_MM: f64 = 7.0;
 const FLAT_SUPPORT_MIN: f64 = 0.9;
 /// Two borders are one when so much of each lies inside the other.
 const SAME_SHARE: f64 = 0.95;
+/// Borders with a line further inside: one for each side.
+pub const NARROWER: usize = 4;
 /// What differs less in height is at one height, mm.
 pub const STEP_MM: f64 = 12.0;
 
@@ -32,7 +34,7 @@ pub struct Face {
     /// Its border.
     pub rectangle: Rectangle,
     /// For each side the border with a line further inside that may be it, too.
-    pub narrower: [Option<Rectangle>; 4],
+    pub narrower: [Option<Rectangle>; NARROWER],
     /// Over the belt, mm.
     pub height_mm: f64,
     /// Cells that began it.
@@ -55,7 +57,7 @@ pub struct Cuboid {
 impl Face {
     /// A cuboid's top face over a place.
     pub fn cuboid(place: &Rectangle, height_mm: f64) -> Self {
-        let (narrower, cells, is_cuboid) = ([None; 4], 0, true);
+        let (narrower, cells, is_cuboid) = ([None; NARROWER], 0, true);
         Self { rectangle: *place, narrower, height_mm, cells, is_cuboid }
     }
 

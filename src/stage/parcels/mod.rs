@@ -35,7 +35,7 @@ use stack::{Stack, WINDOW_MAX_MM, Window};
 use steps::{Scale, Steps};
 use still::Still;
 
-pub use face::{Cuboid, Face};
+pub use face::{Cuboid, Face, NARROWER};
 pub use rectangle::Rectangle;
 
 /// What is looked at around a beginning, mm.
@@ -401,7 +401,7 @@ impl Parcels {
         });
         let rectangle = around.moved_in(excess_mm, covered);
         let height_mm = self.scroll.height_of(HIGHEST_SHARE, |_| true);
-        let (narrower, cells) = ([None; 4], group.cells);
+        let (narrower, cells) = ([None; NARROWER], group.cells);
         let face = Face { rectangle, narrower, height_mm, cells, is_cuboid: false };
         let is_wide = rectangle.length_mm.min(rectangle.width_mm) > SIDE_MIN_MM;
         let is_thing = is_wide && is_border(&rectangle) && !self.scroll.content(&face).is_belt();
