@@ -52,8 +52,8 @@ fn errors_mm(record: &ParcelRecord, ([l, w, h], _): &Parcel) -> [f64; 3] {
     [record.length_mm - l, record.width_mm - w, record.height_mm - h]
 }
 
-/// Each parcel is told once, in their order, and no side is off by more than 3 mm and 3 sigma, or it may not be used;
-/// returns how many may be.
+/// Each parcel is told once, in their order, and each usable record is right to 3 mm or 3 sigma, whichever is more;
+/// returns how many may be used and are right.
 fn right(parcels: &[Parcel], scenario: &Scenario) -> usize {
     let records = measure_scenario(scenario, site(scenario));
     assert_eq!(records.len(), parcels.len(), "{records:#?}");

@@ -160,7 +160,7 @@ pub(super) mod tests {
         assert!(!is_sure(&told(&flat, &doubt)));
         // Heights that are sure need no witness.
         let sure = record([126.0, 52.0, 4.0], 0.7);
-        assert_eq!(told(&flat, &sure), sure);
+        assert_eq!(agreed(&flat, &sure, [0.9, 0.8], SIGMA_MAX_MM), sure);
     }
 
     #[test]

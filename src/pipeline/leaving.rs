@@ -120,17 +120,36 @@ impl Leaving {
         around.next().copied()
     }
 
-    /// The silhouette that something is a label on: it holds the place, and is as high.
-    fn labelled(&mut self, place: &Rectangle, record: &ParcelRecord) -> Option<&mut Silhouette> {
-        self.silhouettes.iter_mut().find(|s| {
-            place.is_detail_of(&s.place) && !s.is_run_together() && is_as_high(&s.record, record)
+    /// The silhouette that something may be a label on: one parcel's, which holds the place and is as high.
+    fn labelled(
+        &self,
+        place: &Rectangle,
+        record: &ParcelRecord,
+        sigma_max_mm: f64,
+    ) -> Option<usize> {
+        let is_measured = record.not_measured.is_none();
+        self.silhouettes.iter().position(|s| {
+            let holds = place.is_detail_of(&s.place) && !self.is_filled(&s.place, place);
+            is_measured
+                && holds
+                && !s.is_run_together()
+                && is_as_high(&s.record, record, sigma_max_mm)
         })
     }
 
+    /// Whether a part of a place, with what passed and what was told inside it, fills it: then it is that of several.
+    fn is_filled(&self, place: &Rectangle, part: &Rectangle) -> bool {
+        let passes = self.passes.iter().map(|passed| &passed.face.rectangle);
+        let others = passes.chain(self.told.iter().map(|told| &told.place));
+        let parts = others.chain([part]).filter(|part| part.is_detail_of(place));
+        parts.map(|part| place.share_inside(part)).sum::<f64>() > PARTS_SHARE_MIN
+    }
+
     /// Whether silhouettes saw a part of a place as something as high as what was seen there.
-    fn has_part(&self, place: &Rectangle, record: &ParcelRecord) -> bool {
+    fn has_part(&self, place: &Rectangle, record: &ParcelRecord, sigma_max_mm: f64) -> bool {
         let mut parts = self.silhouettes.iter().filter(|s| s.place.is_detail_of(place));
-        parts.any(|s| is_sure(&s.record) && is_as_high(&s.record, record))
+        let is_raised = |s: &Silhouette| is_sure(&s.record) && rises(&s.record);
+        parts.any(|s| is_raised(s) && is_as_high(&s.record, record, sigma_max_mm))
     }
 
     /// Remove the silhouette at the place of a pass.
@@ -176,10 +195,10 @@ impl Pipeline {
         while let Some(passed) = self.leaving.passes.get(i).copied() {
             let place = passed.face.rectangle;
             if !all {
-                let rides_on = |track: &Rectangle| place.is_detail_of(track);
+                let lies_within = |track: &Rectangle| place.is_detail_of(track);
                 let is_same = self.riding_at(|track| track.is_same_place(&place));
                 let is_part = |track: &Rectangle| track.is_detail_of(&place);
-                if self.riding_at(rides_on).is_some()
+                if self.riding_at(lies_within).is_some()
                     || is_same.is_none() && self.riding_at(is_part).is_some()
                 {
                     i += 1;
@@ -221,9 +240,7 @@ impl Pipeline {
             self.counters.slivers += 1;
             return;
         }
-        if let Some(outer) = self.leaving.labelled(place, &heights)
-            && outer.record.shape == Shape::Box
-        {
+        if self.labelled(place, &heights).is_some_and(|outer| outer.record.shape == Shape::Box) {
             return;
         }
         let silhouettes = self.leaving.take_silhouette(place);
@@ -242,7 +259,12 @@ impl Pipeline {
                 self.leaving.silhouettes.retain(|s| !place.is_detail_of(&s.place));
                 spread(heights, &around.record, self.sigma_max_mm())
             }
-            (None, None) if !rises(&heights) && !self.leaving.has_part(place, &heights) => return,
+            (None, None)
+                if !rises(&heights)
+                    && !self.leaving.has_part(place, &heights, self.sigma_max_mm()) =>
+            {
+                return;
+            }
             // What has neither a face nor a silhouette is noise.
             (None, None)
                 if heights.shape != Shape::Box && !self.differs_from_belt(&heights, place) =>
@@ -251,12 +273,21 @@ impl Pipeline {
             }
             (None, _) => heights,
         };
+        self.leaving.tell(*place, &record);
         let rival = passed.rival().map(|rival| self.record_of_pass(&rival));
         let record = rival.map_or(record, |rival| spread(record, &rival, self.sigma_max_mm()));
-        self.leaving.tell(*place, &record);
         let silhouettes = silhouettes.map(|silhouettes| silhouettes.record);
         let heights = Some((heights, *passed));
         self.emit_decision(Decision { record, silhouettes, heights }, emit);
+    }
+
+    /// The silhouette that something is a label on, if that will be told.
+    fn labelled(&mut self, place: &Rectangle, record: &ParcelRecord) -> Option<&mut Silhouette> {
+        let i = self.leaving.labelled(place, record, self.sigma_max_mm())?;
+        let outer = self.leaving.silhouettes.get_mut(i)?;
+        let is_shadow =
+            !is_sure(&outer.record) && self.passes.shows_belt(&outer.place, outer.record.height_mm);
+        (!is_shadow).then_some(outer)
     }
 
     fn sigma_max_mm(&self) -> f64 {
@@ -305,9 +336,9 @@ impl Pipeline {
         if self.is_explained(silhouette) {
             return;
         }
-        // Of two borders at one height the outermost is the parcel's; if that is no cuboid's, either may be.
         let sigma_max_mm = self.sigma_max_mm();
-        if let Some(outer) = self.leaving.labelled(&place, &record) {
+        if let Some(outer) = self.labelled(&place, &record) {
+            // Of two borders at one height the outermost is the parcel's; if that is no cuboid's, either may be.
             if outer.record.shape != Shape::Box {
                 outer.record = spread(outer.record, &record, sigma_max_mm);
                 outer.is_certain = false;
@@ -363,9 +394,10 @@ impl Pipeline {
     }
 }
 
-/// Whether two heights differ by no more than their sigmas.
-fn is_as_high(one: &ParcelRecord, other: &ParcelRecord) -> bool {
-    let sigma_mm = one.sigma_height_mm.hypot(other.sigma_height_mm);
+/// Whether two heights differ by no more than their sigmas, of which each counts to the largest that may be used.
+fn is_as_high(one: &ParcelRecord, other: &ParcelRecord, sigma_max_mm: f64) -> bool {
+    let [one_mm, other_mm] = [one, other].map(|r| r.sigma_height_mm.min(sigma_max_mm));
+    let sigma_mm = one_mm.hypot(other_mm);
     (one.height_mm - other.height_mm).abs() <= DISAGREE_SIGMA * sigma_mm
 }
 
@@ -451,21 +483,60 @@ mod tests {
         assert_eq!(leaving.silhouette_around(&label).expect("there").place, ahead.place);
     }
 
+    const SIGMA_MAX_MM: f64 = 3.0;
+    const LABEL: Rectangle = Rectangle { length_mm: 80.0, width_mm: 50.0, ..BOTH };
+
     #[test]
     fn a_label_is_on_what_holds_it_and_is_as_high() {
         let carton = silhouette(0.0, 400.0, true);
-        let label = Rectangle { length_mm: 80.0, width_mm: 50.0, ..BOTH };
+        let is_label = |on: Silhouette, place: &Rectangle, record: &ParcelRecord| {
+            leaving(&[on]).labelled(place, record, SIGMA_MAX_MM).is_some()
+        };
         let as_high = record([80.0, 50.0, 61.0], 0.5);
-        let found = leaving(&[carton]).labelled(&label, &as_high).map(|s| s.place);
-        assert_eq!(found, Some(carton.place));
-        // A smaller parcel on a larger one is no label, nor is what lies on several run together.
+        assert!(is_label(carton, &LABEL, &as_high));
+        // A smaller parcel on a larger one is none, nor is a parcel one on itself.
         let on_top = record([80.0, 50.0, 110.0], 0.5);
-        assert!(leaving(&[carton]).labelled(&label, &on_top).is_none());
+        assert!(!is_label(carton, &LABEL, &on_top));
+        assert!(!is_label(carton, &carton.place, &carton.record));
+        // A height that is hardly known is not as high as everything.
+        let mut vague = carton;
+        vague.record.sigma_height_mm = 30.0;
+        assert!(!is_label(vague, &LABEL, &on_top));
+        // What lies on several run together is none.
         let mut together = carton;
         together.record.flags.set(Flags::MERGED, true);
-        assert!(leaving(&[together]).labelled(&label, &as_high).is_none());
-        // Nor is a parcel a label on itself.
-        assert!(leaving(&[carton]).labelled(&carton.place, &carton.record).is_none());
+        assert!(!is_label(together, &LABEL, &as_high));
+        // What could not be measured has no height.
+        let mut low = carton;
+        low.record.height_mm = 1.0;
+        let brief = ParcelRecord {
+            not_measured: Some(crate::event::NotMeasured::TooBrief),
+            ..record([0.0; 3], 0.0)
+        };
+        assert!(!is_label(low, &LABEL, &brief));
+    }
+
+    #[test]
+    fn two_cartons_seen_as_one_are_no_labels_on_it() {
+        let mut leaving = leaving(&[silhouette(0.0, 410.0, true)]);
+        let [first, second] =
+            [-105.0, 105.0].map(|x_mm| Rectangle { x_mm, length_mm: 200.0, ..BOTH });
+        let carton = record([200.0, 150.0, 60.0], 0.5);
+        leaving.tell(first, &carton);
+        assert!(leaving.labelled(&second, &carton, SIGMA_MAX_MM).is_none());
+        assert!(leaving.labelled(&LABEL, &carton, SIGMA_MAX_MM).is_some());
+    }
+
+    #[test]
+    fn what_is_flat_on_the_belt_is_part_of_nothing() {
+        let flat = |height_mm| {
+            let mut sticker = silhouette(0.0, 60.0, true);
+            sticker.record = record([60.0, 60.0, height_mm], 1.0);
+            sticker
+        };
+        let pass = record([410.0, 150.0, 4.0], 2.5);
+        assert!(!leaving(&[flat(0.5)]).has_part(&BOTH, &pass, SIGMA_MAX_MM));
+        assert!(leaving(&[flat(4.0)]).has_part(&BOTH, &pass, SIGMA_MAX_MM));
     }
 
     #[test]

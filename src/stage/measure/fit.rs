@@ -471,6 +471,7 @@ impl Problem<'_> {
                 let top = (!sample.edge.is_base()).then_some(sample.edge.face());
                 let Some((residual, slope)) = choose(steps(), at, gate_mm, known, rising) else {
                     let other = choose(steps(), at, dissent_mm, -known, rising);
+                    let other = other.filter(|_| known != 0.0);
                     if let (Some(face), Some((residual, _))) = (top, other) {
                         used.dissent[face].add_other(residual);
                     }

@@ -74,7 +74,7 @@ pub struct Measured {
     pub has_edges: bool,
     /// Corners on the top face and its edges disagree about the height.
     pub disputed: bool,
-    /// Another cuboid that explains the edges nearly as well.
+    /// Another cuboid that explains the edges nearly as well, X at the newest view.
     pub rival: Option<Estimate>,
 }
 

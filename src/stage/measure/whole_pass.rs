@@ -17,7 +17,7 @@ use crate::units::BeltRect;
 const FACE_HEIGHT_SIGMA_MM: f64 = 6.0;
 /// The sides of a face that is no cuboid's are good to this, mm.
 const FACE_SIDE_SIGMA_MM: f64 = 5.0;
-/// A border is the better one beyond doubt when it explains this share of the edges more.
+/// A border is the better one beyond doubt when the share of the edges that it explains is so much more.
 const CLEARLY_BETTER: f64 = 0.03;
 /// Lower than this is the belt, mm.
 const HEIGHT_MIN_MM: f64 = 2.4;
@@ -27,7 +27,7 @@ const LINE_MM: f64 = 6.0;
 const ROUNDS: usize = 3;
 /// The same for a cuboid that was fitted before its pass was whole.
 const ROUNDS_AGAIN: usize = 2;
-/// The same for a border further inside, until it is seen to explain more.
+/// The same for a border further inside, until it is seen to explain nearly as much.
 const ROUNDS_RIVAL: usize = 1;
 
 /// The fit, and its memory.
@@ -104,20 +104,24 @@ impl WholePass {
     fn fit(&mut self, views: &Views, face: &Face) -> Option<(Measured, Kept)> {
         let share = |(measured, _): &(Measured, Kept)| measured.estimate.edge_share;
         let mut fit = |border, rounds| self.fit_border(views, border, face.height_mm, rounds);
-        let mut best = fit(&face.rectangle, ROUNDS_AGAIN)?;
+        let mut best = fit(&face.rectangle, ROUNDS_AGAIN);
         let mut others = heapless::Vec::<Estimate, NARROWER>::new();
         for border in face.narrower.iter().flatten() {
-            let least = share(&best) - CLEARLY_BETTER;
-            if fit(border, ROUNDS_RIVAL).is_none_or(|fitted| share(&fitted) <= least) {
+            let known = best.as_ref().map_or(0.0, share);
+            if fit(border, ROUNDS_RIVAL).is_none_or(|first| share(&first) <= known - CLEARLY_BETTER)
+            {
                 continue;
             }
-            let Some(mut other) = fit(border, ROUNDS) else { continue };
-            if share(&other) > share(&best) + CLEARLY_BETTER {
+            let mut other = fit(border, ROUNDS);
+            if other.as_ref().is_some_and(|other| share(other) > known + CLEARLY_BETTER) {
                 std::mem::swap(&mut other, &mut best);
             }
-            // There are as many at most as there are borders.
-            let _ = others.push(other.0.estimate);
+            if let Some((other, _)) = other {
+                // There are as many at most as there are borders.
+                let _ = others.push(other.estimate);
+            }
         }
+        let mut best = best?;
         let least = (share(&best) - CLEARLY_BETTER).max(BOX_EDGE_SHARE_MIN);
         let off_mm = |other: &Estimate| best.0.estimate.off_mm(other);
         let rivals = others.into_iter().filter(|other| other.edge_share > least);
