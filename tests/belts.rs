@@ -4,7 +4,7 @@ mod common;
 #[path = "belts/ribs.rs"]
 mod ribs;
 
-use beltgauge::config::{Config, Site};
+use beltgauge::config::Site;
 use beltgauge::event::{Flags, NotMeasured, ParcelRecord};
 use beltgauge::image::{FrameTime, Plane};
 use beltgauge::pipeline::Pipeline;
@@ -48,13 +48,7 @@ fn belt(parcels: &[([f64; 3], f64)], grey: f64, texture_grey: f64, tables: &str)
 }
 
 fn site(scenario: &Scenario, nominal_mm_per_s: f64) -> Site {
-    let config = format!(
-        "[camera]\ncalibration = \"the scenario's\"\n\
-         [zone]\nx_min_mm = -500\nx_max_mm = 500\ny_min_mm = -300\ny_max_mm = 300\n\
-         [belt]\nspeed_mm_per_s = {nominal_mm_per_s}\n"
-    );
-    let camera = scenario.camera().expect("a valid camera");
-    Site::new(Config::parse(&config).expect("valid"), camera).expect("a zone in view")
+    common::site_of(scenario, [500.0, 300.0], nominal_mm_per_s)
 }
 
 fn is_right(record: &ParcelRecord) -> bool {

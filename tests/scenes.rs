@@ -2,7 +2,7 @@
 
 mod common;
 
-use beltgauge::config::{Config, Site};
+use beltgauge::config::Site;
 use beltgauge::event::{Flags, ParcelRecord, Shape};
 use beltgauge::image::Plane;
 use beltgauge::pipeline::Pipeline;
@@ -51,13 +51,7 @@ fn parcel(size_mm: [f64; 3], yaw_deg: f64, [x_mm, y_mm]: [f64; 2], material: &st
 }
 
 fn site(scenario: &Scenario, nominal_mm_per_s: f64) -> Site {
-    let config = format!(
-        "[camera]\ncalibration = \"the scenario's\"\n\
-         [zone]\nx_min_mm = -600\nx_max_mm = 600\ny_min_mm = -380\ny_max_mm = 380\n\
-         [belt]\nspeed_mm_per_s = {nominal_mm_per_s}\n"
-    );
-    let camera = scenario.camera().expect("a valid camera");
-    Site::new(Config::parse(&config).expect("valid"), camera).expect("a zone in view")
+    common::site_of(scenario, [600.0, 380.0], nominal_mm_per_s)
 }
 
 /// Measure a scenario with a nominal belt speed.

@@ -19,7 +19,8 @@ pub(super) fn is_sure(record: &ParcelRecord) -> bool {
 }
 
 /// The record of a parcel that both saw: of what is not in doubt, else of the one that more edges confirm; of two
-/// that are no cuboids the smaller one. A silhouette that may be one of the belt is no witness of a parcel. `edge_shares`: of the edges that silhouettes and heights led to.
+/// that are no cuboids the smaller one. A silhouette that may be one of the belt is no witness of a parcel.
+/// `edge_shares`: of the edges that silhouettes and heights led to.
 pub(super) fn agreed(
     silhouettes: &ParcelRecord,
     heights: &ParcelRecord,

@@ -4,7 +4,7 @@
 pub mod page;
 pub mod truth;
 
-use beltgauge::config::Site;
+use beltgauge::config::{Config, Site};
 use beltgauge::event::ParcelRecord;
 use beltgauge::image::Plane;
 use beltgauge::source::FrameSource;
@@ -82,6 +82,17 @@ pub fn write_site(folder: &Path, image_size_px: [usize; 2]) -> PathBuf {
     let path = folder.join("beltgauge.toml");
     std::fs::write(&path, config).expect("writable");
     path
+}
+
+/// A scenario's camera over a zone that reaches so far before and past the origin, and to its sides.
+pub fn site_of(scenario: &Scenario, [x_mm, y_mm]: [f64; 2], nominal_mm_per_s: f64) -> Site {
+    let config = format!(
+        "[camera]\ncalibration = \"the scenario's\"\n\
+         [zone]\nx_min_mm = -{x_mm}\nx_max_mm = {x_mm}\ny_min_mm = -{y_mm}\ny_max_mm = {y_mm}\n\
+         [belt]\nspeed_mm_per_s = {nominal_mm_per_s}\n"
+    );
+    let camera = scenario.camera().expect("a valid camera");
+    Site::new(Config::parse(&config).expect("valid"), camera).expect("a zone in view")
 }
 
 /// What the pipeline of a site reports of a synthetic belt.

@@ -157,8 +157,9 @@ struct EdgeUse {
     contrast: f64,
     /// For each edge.
     polarity: Polarity,
-    /// For each edge of the top face, these two.
+    /// For each edge of the top face.
     dark: [DarkEdge; EDGES / 2],
+    /// For each edge of the top face.
     dissent: [Dissent; EDGES / 2],
 }
 
@@ -471,6 +472,7 @@ impl Problem<'_> {
                 let top = (!sample.edge.is_base()).then_some(sample.edge.face());
                 let Some((residual, slope)) = choose(steps(), at, gate_mm, known, rising) else {
                     let other = choose(steps(), at, dissent_mm, -known, rising);
+                    // Before the edge's direction is known none is the other one.
                     let other = other.filter(|_| known != 0.0);
                     if let (Some(face), Some((residual, _))) = (top, other) {
                         used.dissent[face].add_other(residual);
